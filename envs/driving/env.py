@@ -1,0 +1,376 @@
+"""The driving world: reset, transition, observation, and how one is built."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from envs.base import Environment
+from envs.driving import navigation as nav
+from envs.driving import observation as obs
+from envs.driving import traffic as traffic_model
+from envs.driving import vehicle
+from envs.driving.geometry import box_contact, circle_contact, touches_sidewalk
+from envs.driving.maps import MapSettings, generate
+from envs.driving.recorded import load_recordings
+from envs.driving.scenario import Capacity, Description, Scenario, pack, stack, take
+from ppl_jax.types import Outcome
+
+TRAINING_SCENARIOS = range(100, 150)
+HELD_OUT_SCENARIOS = range(1000, 1050)
+HORIZON = 1500  # steps of 0.1 s
+CONTACT_MARGIN = 0.04  # m: closer than this counts as touching, as in the simulator
+_HALF = jnp.array(vehicle.HALF_SIZE, jnp.float32)
+
+
+@flax.struct.dataclass
+class DrivingParams:
+    """Traced parameters of the world.
+
+    Attributes:
+        scenarios: Pool with a leading [S] axis.
+        progress_weight, speed_weight: Of the reward's terms (per m; per share of 80 km/h).
+        success_reward, off_road_penalty, crash_penalty: Replace the reward in that step.
+        off_road_cost, crash_vehicle_cost, crash_object_cost: Per step.
+    """
+
+    scenarios: Scenario
+    progress_weight: jax.Array | float = 1.0
+    speed_weight: jax.Array | float = 0.1
+    success_reward: jax.Array | float = 10.0
+    off_road_penalty: jax.Array | float = 5.0
+    crash_penalty: jax.Array | float = 5.0
+    off_road_cost: jax.Array | float = 1.0
+    crash_vehicle_cost: jax.Array | float = 1.0
+    crash_object_cost: jax.Array | float = 1.0
+
+
+@flax.struct.dataclass
+class DrivingState:
+    """Everything that changes.
+
+    Attributes:
+        scenario: Index into the pool.
+        ego: `vehicle.Ego`.
+        navigation: `navigation.Navigation`.
+        left, right: Distances to the reference road's edges, m.
+        lateral: Lateral offset on the current lane, m.
+        traffic: `traffic.Traffic`.
+        touching: [N] bool, traffic vehicles in contact with the ego.
+        time: Steps since the start.
+    """
+
+    scenario: jax.Array
+    ego: vehicle.Ego
+    navigation: nav.Navigation
+    left: jax.Array
+    right: jax.Array
+    lateral: jax.Array
+    traffic: traffic_model.Traffic
+    touching: jax.Array
+    time: jax.Array
+
+
+class Events(NamedTuple):
+    """What happened in a step, booleans."""
+
+    arrived: jax.Array
+    off_road: jax.Array
+    crash_vehicle: jax.Array
+    crash_object: jax.Array
+
+
+class Contacts(NamedTuple):
+    """Overlaps of the ego: depth, m, and direction out, per solid thing."""
+
+    depth: jax.Array
+    out: jax.Array
+    traffic: jax.Array
+    vehicle: jax.Array
+    object: jax.Array
+
+
+def contacts(
+    scenario: Scenario, pose: jax.Array, traffic_pose: jax.Array, present: jax.Array
+) -> Contacts:
+    """What the ego touches at `pose` [3]."""
+    objects = scenario.objects
+    boxes = jnp.concatenate(
+        [jnp.where(present[:, None], traffic_pose, 1e6), objects.box_pose]
+    )
+    half = jnp.concatenate([scenario.traffic.half, objects.box_half])
+    box_depth, box_out = box_contact(pose, _HALF, boxes, half)
+    circle_depth, circle_out = circle_contact(pose, _HALF, objects.circle)
+    n = present.shape[0]
+    hit = box_depth > -CONTACT_MARGIN
+    hit_object = hit[n:]
+    return Contacts(
+        depth=jnp.concatenate([box_depth, circle_depth]),
+        out=jnp.concatenate([box_out, circle_out]),
+        traffic=hit[:n],
+        vehicle=jnp.any(hit[:n]) | jnp.any(hit_object & objects.box_is_vehicle),
+        object=jnp.any(hit_object & ~objects.box_is_vehicle)
+        | jnp.any(circle_depth > -CONTACT_MARGIN),
+    )
+
+
+def off_road(found: nav.Localised, scenario: Scenario, pose: jax.Array) -> jax.Array:
+    """Centre on no lane, or car on a sidewalk, or centre outside the reference road."""
+    return (
+        ~found.on_lane
+        | touches_sidewalk(scenario.lanes, found.long, found.lateral, pose, _HALF)
+        | (found.left < 0)
+        | (found.right < 0)
+    )
+
+
+def reward_and_cost(
+    params: DrivingParams,
+    scenario: Scenario,
+    events: Events,
+    navigation: nav.Navigation,
+    long: jax.Array,
+    ego: vehicle.Ego,
+) -> tuple[jax.Array, jax.Array]:
+    """Reward and cost of a step.
+
+        reward = progress along the current lane + 0.1 speed / 80 km/h,
+        replaced by +10 on arrival, else -5 off the road, else -5 in contact
+
+    Progress is measured on the current lane where that is one of the reference road's, else on
+    the road's leftmost lane. Source: `envs/metadrive_env.py` of MetaDrive 0.4.3.
+
+    Args:
+        long: [M] ego's position along every lane, m.
+    """
+    lanes = scenario.lanes
+    on_reference = lanes.route[navigation.lane] == navigation.road
+    lane_index = jnp.where(on_reference, navigation.lane, scenario.route_lane[navigation.road])
+    lane = take(lanes, lane_index)
+    before, _ = nav.lane_coordinates(lane, ego.last_pose[:2])
+    speed = jnp.sqrt(jnp.sum(ego.velocity**2))
+    reward = (
+        params.progress_weight * (long[lane_index] - before)
+        + params.speed_weight * speed / vehicle.MAX_SPEED
+    )
+    crashed = events.crash_vehicle | events.crash_object
+    reward = jnp.where(crashed, -params.crash_penalty, reward)
+    reward = jnp.where(events.off_road, -params.off_road_penalty, reward)
+    reward = jnp.where(events.arrived, params.success_reward, reward)
+    cost = jnp.where(
+        events.off_road,
+        params.off_road_cost,
+        jnp.where(
+            events.crash_vehicle,
+            params.crash_vehicle_cost,
+            jnp.where(events.crash_object, params.crash_object_cost, 0.0),
+        ),
+    )
+    return reward, cost
+
+
+def _push_out(ego: vehicle.Ego, touch: Contacts) -> vehicle.Ego:
+    """Let the ego not pass through the deepest thing it overlaps.
+
+    It is moved out and loses its velocity into the thing. The physics engine's bounces and spins
+    are not modelled.
+    """
+    worst = jnp.argmax(touch.depth)
+    depth = jnp.maximum(touch.depth[worst], 0.0)
+    out = touch.out[worst]
+    into = jnp.minimum(jnp.sum(ego.velocity * out), 0.0)
+    hit = depth > 0
+    shift = jnp.append(depth * out, 0.0)
+    return ego.replace(
+        pose=ego.pose + shift,
+        body=ego.body + shift,
+        velocity=jnp.where(hit, ego.velocity - into * out, ego.velocity),
+        yaw_rate=jnp.where(hit, 0.5 * ego.yaw_rate, ego.yaw_rate),
+    )
+
+
+class Driving(Environment):
+    """MetaDrive-like driving as pure functions. Build one with `make_driving`."""
+
+    name = "driving"
+    observation_size = obs.SIZE
+    action_size = 2
+    max_episode_steps = HORIZON
+
+    def __init__(self, default_params: DrivingParams, held_out_params: DrivingParams):
+        self.default_params = default_params
+        self.held_out_params = held_out_params
+
+    def scenario_count(self, params: DrivingParams) -> int:
+        """Number of scenarios in the pool."""
+        return params.scenarios.number.shape[0]
+
+    def reset_to(self, index: jax.Array, key: jax.Array, params: DrivingParams) -> DrivingState:
+        """The start of scenario `index` of the pool: standing, 5 m along its lane."""
+        del key  # a scenario is deterministic
+        scenario = take(params.scenarios, index)
+        lane = take(scenario.lanes, scenario.spawn_lane)
+        long, zero = jnp.float32(5.0), jnp.zeros((), jnp.float32)
+        position = nav.lane_position(lane, long, zero)
+        pose = jnp.append(position, nav.lane_heading(lane, long))
+        ego = vehicle.place(pose, jnp.zeros(2), zero, jnp.zeros(2))
+        navigation, found = nav.localise(scenario, nav.start(scenario), pose)
+        traffic = traffic_model.start(scenario)
+        return DrivingState(
+            scenario=jnp.asarray(index, jnp.int32),
+            ego=ego,
+            navigation=navigation,
+            left=found.left,
+            right=found.right,
+            lateral=found.lateral[navigation.lane],
+            traffic=traffic,
+            touching=jnp.zeros(traffic.status.shape, bool),
+            time=jnp.zeros((), jnp.int32),
+        )
+
+    def transition(
+        self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
+    ) -> tuple[DrivingState, Outcome]:
+        """One control step of 0.1 s, without reset."""
+        del key  # the world is deterministic
+        scenario = take(params.scenarios, state.scenario)
+        lane = take(scenario.lanes, state.navigation.lane)
+        ego_long, _ = nav.lane_coordinates(lane, state.ego.pose[:2])
+        speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
+        traffic = traffic_model.advance(
+            scenario, state.traffic, state.navigation.lane, ego_long, speed, state.touching
+        )
+        ego = vehicle.drive(
+            state.ego, action, scenario.engine_force, scenario.brake_force,
+            scenario.wheel_friction,
+        )
+        return self._finish(params, scenario, state, ego, traffic, solid=True)
+
+    def transition_kinematic(
+        self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
+    ) -> tuple[DrivingState, Outcome]:
+        """The paper's rule-based prediction step: kinematic bicycle, traffic frozen."""
+        del key
+        scenario = take(params.scenarios, state.scenario)
+        ego = vehicle.drive_kinematic(
+            state.ego, action, scenario.engine_force, scenario.brake_force
+        )
+        return self._finish(params, scenario, state, ego, state.traffic, solid=False)
+
+    def _finish(
+        self,
+        params: DrivingParams,
+        scenario: Scenario,
+        state: DrivingState,
+        ego: vehicle.Ego,
+        traffic: traffic_model.Traffic,
+        solid: bool,
+    ) -> tuple[DrivingState, Outcome]:
+        present = traffic.status != traffic_model.REMOVED
+        touch = contacts(scenario, ego.pose, traffic_model.poses(scenario, traffic), present)
+        if solid:
+            ego = _push_out(ego, touch)
+        navigation, found = nav.localise(scenario, state.navigation, ego.pose)
+        events = Events(
+            arrived=nav.arrived(scenario, navigation, found),
+            off_road=off_road(found, scenario, ego.pose),
+            crash_vehicle=touch.vehicle,
+            crash_object=touch.object,
+        )
+        reward, cost = reward_and_cost(params, scenario, events, navigation, found.long, ego)
+        time = state.time + 1
+        new_state = DrivingState(
+            scenario=state.scenario,
+            ego=ego,
+            navigation=navigation,
+            left=found.left,
+            right=found.right,
+            lateral=found.lateral[navigation.lane],
+            traffic=traffic,
+            touching=touch.traffic,
+            time=time,
+        )
+        return new_state, Outcome(
+            reward=reward,
+            terminated=events.arrived | events.off_road,
+            truncated=time >= HORIZON,
+            cost=cost,
+            success=events.arrived,
+            unsafe=(events.off_road | events.crash_vehicle | events.crash_object)
+            & ~events.arrived,
+            progress=navigation.travelled / scenario.route_length,
+            speed=jnp.sqrt(jnp.sum(ego.velocity**2)),
+        )
+
+    def observe(self, state: DrivingState, params: DrivingParams) -> jax.Array:
+        """The 259 values (see `envs.driving.observation`)."""
+        scenario = take(params.scenarios, state.scenario)
+        features = obs.ego_features(
+            scenario, state.ego, state.navigation, state.left, state.right, state.lateral
+        )
+        rays = obs.lidar_reading(
+            scenario,
+            state.ego.pose,
+            traffic_model.poses(scenario, state.traffic),
+            state.traffic.status != traffic_model.REMOVED,
+        )
+        return jnp.concatenate([features, rays])
+
+
+def make_params(
+    descriptions: Sequence[Description], capacity: Capacity | None = None
+) -> DrivingParams:
+    """Pack scenarios into parameters of the world.
+
+    Raises:
+        ValueError: If there are none, or one does not fit `capacity`.
+    """
+    if not descriptions:
+        raise ValueError("a driving world needs at least one scenario")
+    capacity = capacity or Capacity.of(descriptions)
+    pool = stack([pack(description, capacity) for description in descriptions])
+    weights = {
+        field: jnp.float32(value.default)
+        for field, value in DrivingParams.__dataclass_fields__.items()
+        if field != "scenarios"
+    }
+    return DrivingParams(scenarios=jax.tree.map(jnp.asarray, pool), **weights)
+
+
+def make_driving(
+    scenarios: str | Path | None = None,
+    held_out_scenarios: str | Path | None = None,
+    settings: MapSettings | None = None,
+    training: Sequence[int] = TRAINING_SCENARIOS,
+    held_out: Sequence[int] = HELD_OUT_SCENARIOS,
+) -> Driving:
+    """Build the driving world.
+
+    Args:
+        scenarios: Folder of recorded scenarios to train on; generated ones where None.
+        held_out_scenarios: Folder of recorded scenarios to evaluate on; those of `scenarios`
+            where None and `scenarios` is given.
+        settings: Of generated maps.
+        training, held_out: Numbers of the generated scenarios.
+
+    Raises:
+        ValueError: If a folder is missing or holds no recording.
+    """
+    settings = settings or MapSettings()
+    if scenarios is not None:
+        train = load_recordings(scenarios)
+    else:
+        train = [generate(number, settings) for number in training]
+    if held_out_scenarios is not None:
+        evaluate = load_recordings(held_out_scenarios)
+    elif scenarios is not None:
+        evaluate = train
+    else:
+        evaluate = [generate(number, settings) for number in held_out]
+    capacity = Capacity.of([*train, *evaluate])
+    return Driving(make_params(train, capacity), make_params(evaluate, capacity))

@@ -1,0 +1,175 @@
+"""Lane coordinates, rectangles and their overlaps, for one point or body at a time."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from envs.driving.scenario import SIDEWALK, Lanes
+
+
+def wrap(angle: jax.Array) -> jax.Array:
+    """Wrap to [-pi, pi)."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def unit(heading: jax.Array) -> jax.Array:
+    """Unit vector of a heading, [...] -> [..., 2]."""
+    return jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
+
+
+def to_body(vector: jax.Array, heading: jax.Array) -> jax.Array:
+    """World vectors in a body frame (x forward, y left), [..., 2]."""
+    c, s = jnp.cos(heading), jnp.sin(heading)
+    x, y = vector[..., 0], vector[..., 1]
+    return jnp.stack([c * x + s * y, -s * x + c * y], -1)
+
+
+def lane_coordinates(lanes: Lanes, position: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(long, lateral) of a point on each lane; lateral is positive to the right.
+
+    Args:
+        lanes: `Lanes`, any leading shape that broadcasts with `position[..., 0]`.
+        position: [..., 2] m.
+    """
+    delta = position - lanes.start
+    straight_long = jnp.sum(delta * lanes.forward, -1)
+    straight_lateral = delta[..., 0] * lanes.forward[..., 1] - delta[..., 1] * lanes.forward[..., 0]
+    radial = position - lanes.center
+    distance = jnp.sqrt(jnp.sum(radial * radial, -1) + 1e-12)
+    phi = lanes.turn * (jnp.arctan2(radial[..., 1], radial[..., 0]) - lanes.phase)
+    # an arc's ends part the circle: a point belongs to the nearer one
+    arc_long = (wrap(phi - lanes.angle / 2) + lanes.angle / 2) * lanes.radius
+    is_arc = lanes.turn != 0
+    return (
+        jnp.where(is_arc, arc_long, straight_long),
+        jnp.where(is_arc, lanes.turn * (distance - lanes.radius), straight_lateral),
+    )
+
+
+def lane_heading(lanes: Lanes, long: jax.Array) -> jax.Array:
+    """Heading of the centre line at `long`, rad."""
+    straight = jnp.arctan2(lanes.forward[..., 1], lanes.forward[..., 0])
+    return jnp.where(
+        lanes.turn != 0, lanes.phase + lanes.turn * (long / lanes.radius + jnp.pi / 2), straight
+    )
+
+
+def lane_position(lanes: Lanes, long: jax.Array, lateral: jax.Array) -> jax.Array:
+    """World position of (long, lateral), [..., 2]."""
+    right = jnp.stack([lanes.forward[..., 1], -lanes.forward[..., 0]], -1)
+    straight = lanes.start + long[..., None] * lanes.forward + lateral[..., None] * right
+    phi = lanes.turn * long / lanes.radius + lanes.phase
+    curved = lanes.center + (lanes.radius + lateral * lanes.turn)[..., None] * unit(phi)
+    return jnp.where((lanes.turn != 0)[..., None], curved, straight)
+
+
+def on_lanes(lanes: Lanes, long: jax.Array, lateral: jax.Array) -> jax.Array:
+    """Which lanes hold the point (long, lateral), given in each lane's coordinates, bool."""
+    share = long / lanes.length
+    right_edge = jnp.where(
+        lanes.taper == 0,
+        lanes.width / 2,
+        jnp.where(lanes.taper == 1, 0.5 - share, share - 0.5) * lanes.width,
+    )
+    return (
+        (long >= lanes.begin)
+        & (long <= lanes.reach)
+        & (lateral >= -lanes.width / 2)
+        & (lateral <= right_edge)
+    )
+
+
+def touches_sidewalk(
+    lanes: Lanes, long: jax.Array, lateral: jax.Array, pose: jax.Array, half: jax.Array
+) -> jax.Array:
+    """Whether a rectangle touches the sidewalk of any lane, bool scalar.
+
+    Args:
+        lanes: [M].
+        long, lateral: The rectangle's centre in each lane's coordinates, [M].
+        pose: [3] x, y, heading.
+        half: [2] half length and half width, m.
+    """
+    angle = wrap(pose[2] - lane_heading(lanes, long))
+    c, s = jnp.abs(jnp.cos(angle)), jnp.abs(jnp.sin(angle))
+    reach_long, reach_lateral = half[0] * c + half[1] * s, half[0] * s + half[1] * c
+    # nearest and farthest point of the rectangle from an arc's centre
+    center = jnp.abs(to_body(lanes.center - pose[:2], pose[2]))
+    nearest = jnp.sqrt(jnp.sum(jnp.maximum(center - half, 0.0) ** 2, -1))
+    farthest = jnp.sqrt(jnp.sum((center + half) ** 2, -1))
+    is_arc = lanes.turn != 0
+    inner = jnp.where(lanes.turn > 0, nearest - lanes.radius, lanes.radius - farthest)
+    outer = jnp.where(lanes.turn > 0, farthest - lanes.radius, lanes.radius - nearest)
+    low = jnp.where(is_arc, inner, lateral - reach_lateral)
+    high = jnp.where(is_arc, outer, lateral + reach_lateral)
+    edge = lanes.width / 2
+    return jnp.any(
+        lanes.kerb
+        & (high >= edge + SIDEWALK[0])
+        & (low <= edge + SIDEWALK[1])
+        & (long + reach_long >= 0)
+        & (long - reach_long <= lanes.length)
+    )
+
+
+def box_contact(
+    pose: jax.Array, half: jax.Array, others: jax.Array, other_half: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Overlap of a rectangle with others by separating axes.
+
+    Args:
+        pose, half: [3] and [2].
+        others, other_half: [K, 3] and [K, 2].
+
+    Returns:
+        Depth [K] (m, positive when they overlap) and the direction out of the other, [K, 2]
+        (world).
+    """
+    delta = pose[:2] - others[:, :2]
+    relative = pose[2] - others[:, 2]
+    c, s = jnp.abs(jnp.cos(relative)), jnp.abs(jnp.sin(relative))
+    mine = to_body(delta, pose[2])
+    theirs = to_body(delta, others[:, 2])
+    swap = jnp.array([1, 0])
+    on_mine = half + other_half * c[:, None] + other_half[:, swap] * s[:, None] - jnp.abs(mine)
+    on_theirs = other_half + half * c[:, None] + half[swap] * s[:, None] - jnp.abs(theirs)
+    depths = jnp.concatenate([on_mine, on_theirs], -1)
+    best = jnp.argmin(depths, -1)
+    ahead = unit(jnp.stack([jnp.broadcast_to(pose[2], others[:, 2].shape), others[:, 2]], -1))
+    left = jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
+    axes = jnp.stack([ahead[:, 0], left[:, 0], ahead[:, 1], left[:, 1]], 1)
+    signs = jnp.sign(jnp.concatenate([mine, theirs], -1))
+    axis = jnp.take_along_axis(axes, best[:, None, None], 1)[:, 0]
+    sign = jnp.take_along_axis(signs, best[:, None], 1)
+    return jnp.min(depths, -1), axis * sign
+
+
+def circle_contact(
+    pose: jax.Array, half: jax.Array, circles: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Overlap of a rectangle with circles.
+
+    Args:
+        pose, half: [3] and [2].
+        circles: [C, 3] x, y, radius.
+
+    Returns:
+        Depth [C] (m, positive when they overlap) and the direction out of the circle, [C, 2].
+    """
+    local = to_body(circles[:, :2] - pose[:2], pose[2])
+    closest = jnp.clip(local, -half, half)
+    gap = closest - local
+    distance = jnp.sqrt(jnp.sum(gap * gap, -1) + 1e-12)
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    inside = jnp.all(jnp.abs(local) < half, -1)
+    # a circle whose centre is inside is left across the rectangle's long sides
+    out = jnp.where(
+        inside[:, None], jnp.stack([0 * local[:, 0], -jnp.sign(local[:, 1])], -1),
+        gap / distance[:, None],
+    )
+    depth = jnp.where(
+        inside, circles[:, 2] + half[1] - jnp.abs(local[:, 1]), circles[:, 2] - distance
+    )
+    world = jnp.stack([c * out[:, 0] - s * out[:, 1], s * out[:, 0] + c * out[:, 1]], -1)
+    return depth, world
