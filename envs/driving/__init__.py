@@ -1,0 +1,1 @@
+"""A jitted driving world true to MetaDrive."""
