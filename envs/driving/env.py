@@ -123,7 +123,7 @@ def off_road(found: nav.Localised, scenario: Scenario, pose: jax.Array) -> jax.A
     """Centre on no lane, or car on a sidewalk, or centre outside the reference road."""
     return (
         ~found.on_lane
-        | touches_sidewalk(scenario.lanes, found.long, found.lateral, pose, _HALF)
+        | touches_sidewalk(scenario.lanes, scenario.kerbs, pose, _HALF)
         | (found.left < 0)
         | (found.right < 0)
     )

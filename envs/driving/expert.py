@@ -7,7 +7,7 @@ or after a takeover, it does the right thing from there.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,35 @@ from envs.driving import traffic as traffic_model
 from envs.driving.env import DrivingParams, DrivingState
 from envs.driving.geometry import lane_coordinates, lane_position, to_body
 from envs.driving.scenario import Scenario, take
-from envs.driving.vehicle import MAX_STEERING, WHEELBASE
+from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
 
 CRUISE_SPEED = 14.0  # m/s
-LATERAL_ACCELERATION = 3.6  # m/s^2, allowed in bends
+LATERAL_ACCELERATION = 3.5  # m/s^2, allowed in bends
 COMFORT_BRAKING = 3.0  # m/s^2, when slowing for a bend or an object
+CREEP_SPEED = 1.5  # m/s, to steer round something from standstill
 SIGHT = 60.0  # m along the route
 LANES = 5  # lane numbers looked at
-_CAR_LENGTH = 4.5
+_HALF_LENGTH, _HALF_WIDTH = HALF_SIZE
+_SIDE_MARGIN = 0.35  # m kept beside things
 _LANE_CHANGE_COST, _EDGE_COST = 6.0, 4.0  # m of free road a lane change, an outer lane is worth
+_PREVIEW = 0.25  # s: the yaw rate follows the wheel that much later
+
+
+class Things(NamedTuple):
+    """What is on the route around the ego, [J], in road coordinates.
+
+    Attributes:
+        ahead: Distance along the route from the ego's centre, m; inf off the route.
+        lateral: Position across the reference road, m right of its leftmost lane's centre.
+        half_length, half_width: m.
+        speed: m/s.
+    """
+
+    ahead: jax.Array
+    lateral: jax.Array
+    half_length: jax.Array
+    half_width: jax.Array
+    speed: jax.Array
 
 
 def _along_route(scenario: Scenario, road: jax.Array, long: jax.Array) -> jax.Array:
@@ -75,114 +95,109 @@ def scripted_expert(
     here = lateral / width  # lane number as a real number
     ego_along = _along_route(scenario, road, long)
 
-    free, front_speed, beside = _look(scenario, state, ego_along, long, lateral)
-    target = _choose_lane(scenario, road, here, free, front_speed, beside, speed)
+    things = _things(scenario, state, ego_along)
+    target = _choose_lane(scenario, road, here, things, speed, width)
 
     # steering: pure pursuit of the target lane's centre line
-    reach = jnp.clip(0.7 * speed + 3.0, 6.0, 14.0)
-    shift = jnp.clip(target * width - lateral, -0.3 * reach, 0.3 * reach)
-    goal, _ = _point_ahead(scenario, road, long + reach, lateral + shift)
-    local = to_body(goal - ego.pose[:2], ego.pose[2])
+    reach = jnp.clip(0.5 * speed + 2.0, 4.0, 9.0)
+    shift = jnp.clip(target * width - lateral, -0.25 * reach, 0.25 * reach)
+    begin = long + _PREVIEW * speed
+    goal, _ = _point_ahead(scenario, road, begin + reach, lateral + shift)
+    heading = ego.pose[2] + _PREVIEW * ego.yaw_rate
+    origin = ego.pose[:2] + _PREVIEW * ego.velocity
+    local = to_body(goal - origin, heading)
     bend = 2.0 * local[1] / jnp.maximum(jnp.sum(local * local), 1.0)
     steer = jnp.arctan(WHEELBASE * bend) / MAX_STEERING
 
-    # speed: bends ahead, then what is ahead on the lanes the car is on or moves to
+    # speed: bends ahead, then what is in the way of where the car is and where it goes
     distances = jnp.arange(0.0, 41.0, 4.0)
     _, curvature = jax.vmap(lambda d: _point_ahead(scenario, road, long + d, target * width))(
         distances
     )
     bend_speed = jnp.sqrt(LATERAL_ACCELERATION / jnp.maximum(jnp.abs(curvature), 1e-3))
-    allowed = jnp.sqrt(bend_speed**2 + 2 * COMFORT_BRAKING * jnp.maximum(distances - 2.0, 0.0))
+    allowed = jnp.sqrt(bend_speed**2 + 2 * COMFORT_BRAKING * jnp.maximum(distances - 3.0, 0.0))
     wish = jnp.minimum(jnp.min(allowed), CRUISE_SPEED)
-    number = jnp.arange(LANES)
-    in_way = (jnp.abs(number - here) < 0.75) | (number == target)
-    room = jnp.maximum(free - 2.0 - 0.3 * speed, 0.0)
-    follow = jnp.sqrt(front_speed**2 + 2 * COMFORT_BRAKING * room)
-    follow = jnp.where(free < 1.0, jnp.minimum(follow, 0.8 * front_speed), follow)
+    gap = things.ahead - things.half_length - _HALF_LENGTH
+    reach_side = things.half_width + _HALF_WIDTH + _SIDE_MARGIN
+    from_here = jnp.abs(things.lateral - lateral)
+    from_target = jnp.abs(things.lateral - target * width)
+    in_way = (things.ahead > 0) & ((from_here < reach_side) | (from_target < reach_side))
+    room = jnp.maximum(gap - 2.0 - 0.3 * speed, 0.0)
+    follow = jnp.sqrt(things.speed**2 + 2 * COMFORT_BRAKING * room)
+    follow = jnp.where(gap < 1.5, jnp.minimum(follow, 0.8 * things.speed), follow)
+    # past something at rest beside the target lane the car may creep
+    passing = (things.speed < 0.5) & (from_target > reach_side - 0.2) & (gap > 0.2)
+    follow = jnp.where(passing, jnp.maximum(follow, CREEP_SPEED), follow)
     wish = jnp.minimum(wish, jnp.min(jnp.where(in_way, follow, jnp.inf)))
-    wish = jnp.maximum(wish, 0.0)
 
     # the throttle or brake that gives the wanted acceleration
-    wanted = 1.5 * (wish - speed)
-    engine = 4 * scenario.engine_force / 1100.0
-    brake = 4 * scenario.brake_force / (1100.0 * 0.02)
+    wanted = 2.0 * (wish - speed)
+    engine = 4 * scenario.engine_force / MASS
+    brake = 4 * scenario.brake_force / (MASS * SUBSTEP)
     pedal = jnp.where(wanted >= -0.2, wanted / engine, wanted / brake)
     return jnp.clip(jnp.stack([steer, pedal]), -1.0, 1.0)
 
 
-def _look(
-    scenario: Scenario,
-    state: DrivingState,
-    ego_along: jax.Array,
-    long: jax.Array,
-    lateral: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Free distance ahead, speed of what ends it, and whether something is beside, per lane.
-
-    Returns:
-        Three arrays [LANES]: m (at most `SIGHT`), m/s, bool.
-    """
+def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Things:
     lanes, objects, traffic = scenario.lanes, scenario.objects, state.traffic
     plan = scenario.traffic
     leg = jnp.take_along_axis(plan.way_first, traffic.leg[:, None], 1)[:, 0]
     present = traffic.status != traffic_model.REMOVED
     lane = jnp.concatenate([jnp.where(present, leg + traffic.number, -1), objects.lane])
-    where = jnp.concatenate([traffic.long, objects.long])
-    pace = jnp.concatenate([traffic.speed, jnp.zeros_like(objects.long)])
-    half = jnp.concatenate([plan.half[:, 0], objects.box_half[:, 0], objects.circle[:, 2]])
+    long = jnp.concatenate([traffic.long, objects.long])
+    lateral = jnp.concatenate([traffic.lateral, objects.lateral])
+    half = jnp.concatenate(
+        [plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)]
+    )
     route = jnp.where(lane >= 0, lanes.route[lane], -1)
     # positions on curved lanes, scaled to the leftmost lane's length
     first = scenario.route_lane[jnp.maximum(route, 0)]
-    share = where / lanes.length[lane] * lanes.length[first]
+    share = long / lanes.length[lane] * lanes.length[first]
     ahead = _along_route(scenario, jnp.maximum(route, 0), share) - ego_along
-    ahead = jnp.where(route >= 0, ahead, jnp.inf)
-    number = lanes.number[lane]
-
-    gap = ahead - half - _CAR_LENGTH / 2
-    on = number[None] == jnp.arange(LANES)[:, None]
-    in_front = on & (ahead > 0.0)
-    gaps = jnp.where(in_front, gap, SIGHT)
-    nearest = jnp.argmin(gaps, -1)
-    free = jnp.minimum(jnp.min(gaps, -1), SIGHT)
-    front_speed = jnp.where(free < SIGHT, pace[nearest], 30.0)
-    # something overlapping lengthwise, or a vehicle about to draw level
-    level = (ahead - half - _CAR_LENGTH / 2 < 1.5) & (ahead + half + _CAR_LENGTH / 2 > -2.0)
-    return free, front_speed, jnp.any(on & level, -1)
+    return Things(
+        ahead=jnp.where(route >= 0, ahead, jnp.inf),
+        lateral=lanes.number[lane] * lanes.width[lane] + lateral,
+        half_length=half[:, 0],
+        half_width=half[:, 1],
+        speed=jnp.concatenate([traffic.speed, jnp.zeros_like(objects.long)]),
+    )
 
 
 def _choose_lane(
     scenario: Scenario,
     road: jax.Array,
     here: jax.Array,
-    free: jax.Array,
-    front_speed: jax.Array,
-    beside: jax.Array,
+    things: Things,
     speed: jax.Array,
+    width: jax.Array,
 ) -> jax.Array:
-    """The lane to head for: the present one or a neighbour, by free road ahead."""
+    """The lane to head for, the present one or a neighbour: the one with most free road."""
     number = jnp.arange(LANES)
     size = scenario.route_size[road]
     following = jnp.minimum(road + 1, scenario.route_roads - 1)
     usable = jnp.minimum(size, scenario.route_size[following])
     current = jnp.clip(jnp.round(here), 0, size - 1)
-    value = jnp.minimum(free + 3.0 * jnp.minimum(front_speed, speed), SIGHT)
-    value = value - _LANE_CHANGE_COST * jnp.abs(number - here)
+
+    across = jnp.abs(things.lateral - number[:, None] * width)
+    on = across < things.half_width + _HALF_WIDTH + _SIDE_MARGIN
+    gap = things.ahead - things.half_length - _HALF_LENGTH
+    worth = gap + 4.0 * jnp.minimum(things.speed, speed)
+    free = jnp.min(jnp.where(on & (things.ahead > 0), worth, SIGHT), -1)
+    # something alongside, or about to be
+    behind = things.ahead + things.half_length + _HALF_LENGTH
+    closing = jnp.maximum(things.speed - speed, 0.0)
+    level = (gap < 1.5) & (behind > -1.0 - 2.0 * closing)
+    beside = jnp.any(on & level, -1)
+
+    value = jnp.minimum(free, SIGHT) - _LANE_CHANGE_COST * jnp.abs(number - here)
     edge = (number == 0) | (number == usable - 1)
-    value = value - jnp.where(edge, _EDGE_COST, 0.0) * (usable > 2)
-    value = jnp.where(number < usable, value, -1e3)
+    value = value - jnp.where(edge & (usable > 2), _EDGE_COST, 0.0)
+    value = jnp.where(number < usable, value, value - 200.0)
     # a lane beyond an occupied neighbour is out of reach
     step = jnp.sign(number - current)
     neighbour = jnp.clip(current + step, 0, LANES - 1).astype(jnp.int32)
-    shut = (step != 0) & beside[neighbour] & (jnp.abs(here - number) > 0.3)
+    shut = (step != 0) & beside[neighbour]
     value = jnp.where(shut, value - 500.0, value)
+    value = jnp.where(number < size, value, -1e4)
     best = jnp.argmax(value)
     return jnp.clip(best, current - 1, current + 1).astype(jnp.float32)
-
-
-def as_expert(world: Any) -> Any:
-    """The default expert of the driving world."""
-    del world
-    return scripted_expert
-
-
-__all__ = ["as_expert", "scripted_expert"]

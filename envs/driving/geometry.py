@@ -80,36 +80,33 @@ def on_lanes(lanes: Lanes, long: jax.Array, lateral: jax.Array) -> jax.Array:
     )
 
 
-def touches_sidewalk(
-    lanes: Lanes, long: jax.Array, lateral: jax.Array, pose: jax.Array, half: jax.Array
-) -> jax.Array:
-    """Whether a rectangle touches the sidewalk of any lane, bool scalar.
+_OUTLINE = jnp.array([[1.0, 1.0], [1.0, -1.0], [0.0, 1.0], [0.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
+
+def touches_sidewalk(lanes: Lanes, kerbs: jax.Array, pose: jax.Array, half: jax.Array) -> jax.Array:
+    """Whether a rectangle touches a sidewalk, bool scalar.
+
+    Its corners and the middles of its long sides are looked at: between them the side lies within
+    0.1 m of the sharpest kerb.
 
     Args:
         lanes: [M].
-        long, lateral: The rectangle's centre in each lane's coordinates, [M].
+        kerbs: [W] indices of the lanes with a kerb, -1 padding.
         pose: [3] x, y, heading.
         half: [2] half length and half width, m.
     """
-    angle = wrap(pose[2] - lane_heading(lanes, long))
-    c, s = jnp.abs(jnp.cos(angle)), jnp.abs(jnp.sin(angle))
-    reach_long, reach_lateral = half[0] * c + half[1] * s, half[0] * s + half[1] * c
-    # nearest and farthest point of the rectangle from an arc's centre
-    center = jnp.abs(to_body(lanes.center - pose[:2], pose[2]))
-    nearest = jnp.sqrt(jnp.sum(jnp.maximum(center - half, 0.0) ** 2, -1))
-    farthest = jnp.sqrt(jnp.sum((center + half) ** 2, -1))
-    is_arc = lanes.turn != 0
-    inner = jnp.where(lanes.turn > 0, nearest - lanes.radius, lanes.radius - farthest)
-    outer = jnp.where(lanes.turn > 0, farthest - lanes.radius, lanes.radius - nearest)
-    low = jnp.where(is_arc, inner, lateral - reach_lateral)
-    high = jnp.where(is_arc, outer, lateral + reach_lateral)
-    edge = lanes.width / 2
+    ahead = unit(pose[2])
+    left = jnp.stack([-ahead[1], ahead[0]])
+    points = pose[:2] + _OUTLINE[:, :1] * half[0] * ahead + _OUTLINE[:, 1:] * half[1] * left
+    beside = jax.tree.map(lambda leaf: leaf[kerbs], lanes)
+    long, lateral = lane_coordinates(beside, points[:, None])
+    edge = beside.width / 2
     return jnp.any(
-        lanes.kerb
-        & (high >= edge + SIDEWALK[0])
-        & (low <= edge + SIDEWALK[1])
-        & (long + reach_long >= 0)
-        & (long - reach_long <= lanes.length)
+        (kerbs >= 0)
+        & (lateral >= edge + SIDEWALK[0])
+        & (lateral <= edge + SIDEWALK[1])
+        & (long >= 0)
+        & (long <= beside.length)
     )
 
 

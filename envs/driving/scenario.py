@@ -33,7 +33,6 @@ class Lanes:
         begin, reach: Longitudinal range that counts as on the lane, m. MetaDrive's lane surfaces
             run up to a metre over the ends.
         taper: 0 for a constant width, 1 shrinking to zero, 2 growing from zero.
-        kerb: Sidewalk along the right edge, bool.
         number: 0 for the leftmost lane of its road.
         road_size: Number of lanes of its road.
         route: Position of the lane's road on the ego's route, -1 off it.
@@ -52,7 +51,6 @@ class Lanes:
     begin: jax.Array
     reach: jax.Array
     taper: jax.Array
-    kerb: jax.Array
     number: jax.Array
     road_size: jax.Array
     route: jax.Array
@@ -69,7 +67,7 @@ class Objects:
         box_half: [K, 2] half length and half width, m.
         box_is_vehicle: [K] bool: a hit counts as a vehicle crash.
         circle: [C, 3] x, y, radius, m.
-        lane, long: [K + C] lane index (-1 none) and position along it, m, boxes first.
+        lane, long, lateral: [K + C] lane index (-1 none) and position on it, m, boxes first.
     """
 
     box_pose: jax.Array
@@ -78,6 +76,7 @@ class Objects:
     circle: jax.Array
     lane: jax.Array
     long: jax.Array
+    lateral: jax.Array
 
 
 @flax.struct.dataclass
@@ -116,6 +115,7 @@ class Scenario:
     Attributes:
         number: Its number.
         lanes: `Lanes`.
+        kerbs: [W] indices of the lanes with a sidewalk along their right edge, -1 padding.
         route_lane: [R] index of the leftmost lane of each road of the route.
         route_size: [R] number of lanes of each road.
         route_roads: Number of roads on the route.
@@ -128,6 +128,7 @@ class Scenario:
 
     number: jax.Array
     lanes: Lanes
+    kerbs: jax.Array
     route_lane: jax.Array
     route_size: jax.Array
     route_roads: jax.Array
@@ -202,9 +203,10 @@ class Description:
 
 @dataclasses.dataclass(frozen=True)
 class Capacity:
-    """Array sizes of a pool: lanes, route roads, boxes, circles, vehicles, roads of a vehicle."""
+    """Array sizes of a pool: lanes, kerbs, route roads, boxes, circles, vehicles, their roads."""
 
     lanes: int = 96
+    kerbs: int = 32
     roads: int = 16
     boxes: int = 4
     circles: int = 16
@@ -221,6 +223,9 @@ class Capacity:
 
         return Capacity(
             lanes=largest(lambda d: sum(map(len, d.network.roads.values())), 32),
+            kerbs=largest(
+                lambda d: sum(_has_kerb(lane) for r in d.network.roads.values() for lane in r), 16
+            ),
             roads=largest(lambda d: len(d.nodes), 8),
             boxes=largest(lambda d: sum(o.kind in _BOXES for o in d.objects), 4),
             circles=largest(lambda d: sum(o.kind not in _BOXES for o in d.objects), 8),
@@ -259,6 +264,10 @@ def pack(description: Description, capacity: Capacity) -> Scenario:
     return Scenario(
         number=np.int32(d.number),
         lanes=_pack_lanes(lanes, d.network, d.nodes, route, capacity.lanes),
+        kerbs=_padded(
+            [i for i, (_, _, lane) in enumerate(lanes) if _has_kerb(lane)], capacity.kerbs, -1,
+            np.int32,
+        ),
         route_lane=_padded([index[r, 0] for r in route], capacity.roads, 0, np.int32),
         route_size=_padded([len(d.network.roads[r]) for r in route], capacity.roads, 1, np.int32),
         route_roads=np.int32(len(route)),
@@ -281,6 +290,11 @@ def stack(scenarios: Sequence[Scenario]) -> Scenario:
 def take(pool: Scenario, index: jax.Array) -> Scenario:
     """The scenario at `index` of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)
+
+
+def _has_kerb(lane: Lane) -> bool:
+    """Whether a sidewalk is drawn; bends too tight for one have none."""
+    return lane.kerb and not (lane.turn and lane.width / 2 + SIDEWALK[1] > lane.radius)
 
 
 def _padded(values, size: int, fill, dtype=np.float32) -> np.ndarray:
@@ -312,9 +326,6 @@ def _pack_lanes(
         last = len(np.arange(0.0, lane.length + 1.0, 1.0)) - 1.0
         return last + (1.0 if lane.turn else 0.0)
 
-    def has_kerb(road, number, lane):
-        return lane.kerb and not (lane.turn and lane.width / 2 + SIDEWALK[1] > lane.radius)
-
     return Lanes(
         start=column(lambda r, n, lane: lane.start, _FAR),
         forward=column(forward, 0.0),
@@ -328,7 +339,6 @@ def _pack_lanes(
         begin=column(lambda r, n, lane: -1.0 if lane.turn else 0.0, 0.0),
         reach=column(reach, -1.0),
         taper=column(lambda r, n, lane: {SHRINK: 1, EXTEND: 2}.get(lane.taper, 0), 0, np.int32),
-        kerb=column(has_kerb, False, bool),
         number=column(lambda r, n, lane: n, 0, np.int32),
         road_size=column(lambda r, n, lane: len(network.roads[r]), 1, np.int32),
         route=column(lambda r, n, lane: route_position.get(r, -1), -1, np.int32),
@@ -343,18 +353,19 @@ def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
         lane = _padded(
             [index[o.lane] if o.lane is not None else -1 for o in objects], size, -1, np.int32
         )
-        long = [
-            float(d.network.roads[o.lane[0]][o.lane[1]].local(np.array([o.x, o.y]))[0])
+        local = [
+            np.stack(d.network.roads[o.lane[0]][o.lane[1]].local(np.array([o.x, o.y])))
             if o.lane is not None
-            else 0.0
+            else np.zeros(2)
             for o in objects
         ]
-        return lane, _padded(long, size, 0.0)
+        return lane, _padded(np.array(local).reshape(-1, 2), size, 0.0)
 
     boxes = [o for o in d.objects if o.kind in _BOXES]
     circles = [o for o in d.objects if o.kind not in _BOXES]
-    box_lane, box_long = rows(boxes, capacity.boxes)
-    circle_lane, circle_long = rows(circles, capacity.circles)
+    box_lane, box_local = rows(boxes, capacity.boxes)
+    circle_lane, circle_local = rows(circles, capacity.circles)
+    local = np.concatenate([box_local, circle_local])
     far = np.array([_FAR, _FAR, 0.0])
     return Objects(
         box_pose=_padded(
@@ -370,7 +381,8 @@ def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
             np.array([_FAR, _FAR, 0.1]),
         ),
         lane=np.concatenate([box_lane, circle_lane]),
-        long=np.concatenate([box_long, circle_long]),
+        long=local[:, 0],
+        lateral=local[:, 1],
     )
 
 
