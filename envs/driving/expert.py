@@ -22,6 +22,7 @@ CRUISE_SPEED = 14.0  # m/s
 LATERAL_ACCELERATION = 3.5  # m/s^2, allowed in bends
 COMFORT_BRAKING = 3.0  # m/s^2, when slowing for a bend or an object
 CREEP_SPEED = 1.5  # m/s, to steer round something from standstill
+STAND_OFF = 5.0  # m kept to something at rest: room to steer round it
 SIGHT = 60.0  # m along the route
 LANES = 5  # lane numbers looked at
 _HALF_LENGTH, _HALF_WIDTH = HALF_SIZE
@@ -100,7 +101,8 @@ def scripted_expert(
 
     # steering: pure pursuit of the target lane's centre line
     reach = jnp.clip(0.5 * speed + 2.0, 4.0, 9.0)
-    shift = jnp.clip(target * width - lateral, -0.25 * reach, 0.25 * reach)
+    slant = jnp.where(speed < 4.0, 0.6, 0.25) * reach
+    shift = jnp.clip(target * width - lateral, -slant, slant)
     begin = long + _PREVIEW * speed
     goal, _ = _point_ahead(scenario, road, begin + reach, lateral + shift)
     heading = ego.pose[2] + _PREVIEW * ego.yaw_rate
@@ -122,11 +124,12 @@ def scripted_expert(
     from_here = jnp.abs(things.lateral - lateral)
     from_target = jnp.abs(things.lateral - target * width)
     in_way = (things.ahead > 0) & ((from_here < reach_side) | (from_target < reach_side))
-    room = jnp.maximum(gap - 2.0 - 0.3 * speed, 0.0)
+    keep = jnp.where(things.speed < 0.5, STAND_OFF, 2.0)
+    room = jnp.maximum(gap - keep - 0.3 * speed, 0.0)
     follow = jnp.sqrt(things.speed**2 + 2 * COMFORT_BRAKING * room)
     follow = jnp.where(gap < 1.5, jnp.minimum(follow, 0.8 * things.speed), follow)
-    # past something at rest beside the target lane the car may creep
-    passing = (things.speed < 0.5) & (from_target > reach_side - 0.2) & (gap > 0.2)
+    # on its way past something at rest beside the target lane the car may creep
+    passing = (things.speed < 0.5) & (from_target > reach_side)
     follow = jnp.where(passing, jnp.maximum(follow, CREEP_SPEED), follow)
     wish = jnp.minimum(wish, jnp.min(jnp.where(in_way, follow, jnp.inf)))
 
@@ -144,19 +147,22 @@ def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Th
     leg = jnp.take_along_axis(plan.way_first, traffic.leg[:, None], 1)[:, 0]
     present = traffic.status != traffic_model.REMOVED
     lane = jnp.concatenate([jnp.where(present, leg + traffic.number, -1), objects.lane])
-    long = jnp.concatenate([traffic.long, objects.long])
-    lateral = jnp.concatenate([traffic.lateral, objects.lateral])
+    route = jnp.where(lane >= 0, lanes.route[lane], -1)
+    # positions on curved lanes, scaled to the leftmost lane's length
+    own = leg + traffic.number
+    reference = scenario.route_lane[jnp.maximum(lanes.route[own], 0)]
+    share = traffic.long / lanes.length[own] * lanes.length[reference]
+    offset = traffic.number * lanes.width[own] + traffic.lateral
     half = jnp.concatenate(
         [plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)]
     )
-    route = jnp.where(lane >= 0, lanes.route[lane], -1)
-    # positions on curved lanes, scaled to the leftmost lane's length
-    first = scenario.route_lane[jnp.maximum(route, 0)]
-    share = long / lanes.length[lane] * lanes.length[first]
-    ahead = _along_route(scenario, jnp.maximum(route, 0), share) - ego_along
+    ahead = (
+        _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, objects.along]))
+        - ego_along
+    )
     return Things(
         ahead=jnp.where(route >= 0, ahead, jnp.inf),
-        lateral=lanes.number[lane] * lanes.width[lane] + lateral,
+        lateral=jnp.concatenate([offset, objects.across]),
         half_length=half[:, 0],
         half_width=half[:, 1],
         speed=jnp.concatenate([traffic.speed, jnp.zeros_like(objects.long)]),

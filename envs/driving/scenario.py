@@ -67,7 +67,8 @@ class Objects:
         box_half: [K, 2] half length and half width, m.
         box_is_vehicle: [K] bool: a hit counts as a vehicle crash.
         circle: [C, 3] x, y, radius, m.
-        lane, long, lateral: [K + C] lane index (-1 none) and position on it, m, boxes first.
+        lane, long: [K + C] lane index (-1 none) and position along it, m, boxes first.
+        along, across: [K + C] position along and right of the leftmost lane of that road, m.
     """
 
     box_pose: jax.Array
@@ -76,7 +77,8 @@ class Objects:
     circle: jax.Array
     lane: jax.Array
     long: jax.Array
-    lateral: jax.Array
+    along: jax.Array
+    across: jax.Array
 
 
 @flax.struct.dataclass
@@ -353,19 +355,19 @@ def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
         lane = _padded(
             [index[o.lane] if o.lane is not None else -1 for o in objects], size, -1, np.int32
         )
-        local = [
-            np.stack(d.network.roads[o.lane[0]][o.lane[1]].local(np.array([o.x, o.y])))
-            if o.lane is not None
-            else np.zeros(2)
-            for o in objects
-        ]
-        return lane, _padded(np.array(local).reshape(-1, 2), size, 0.0)
+        place = np.zeros((size, 3), np.float32)
+        for i, o in enumerate(objects):
+            if o.lane is not None:
+                members = d.network.roads[o.lane[0]]
+                point = np.array([o.x, o.y])
+                place[i] = members[o.lane[1]].local(point)[0], *members[0].local(point)
+        return lane, place
 
     boxes = [o for o in d.objects if o.kind in _BOXES]
     circles = [o for o in d.objects if o.kind not in _BOXES]
-    box_lane, box_local = rows(boxes, capacity.boxes)
-    circle_lane, circle_local = rows(circles, capacity.circles)
-    local = np.concatenate([box_local, circle_local])
+    box_lane, box_place = rows(boxes, capacity.boxes)
+    circle_lane, circle_place = rows(circles, capacity.circles)
+    place = np.concatenate([box_place, circle_place])
     far = np.array([_FAR, _FAR, 0.0])
     return Objects(
         box_pose=_padded(
@@ -381,8 +383,9 @@ def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
             np.array([_FAR, _FAR, 0.1]),
         ),
         lane=np.concatenate([box_lane, circle_lane]),
-        long=local[:, 0],
-        lateral=local[:, 1],
+        long=place[:, 0],
+        along=place[:, 1],
+        across=place[:, 2],
     )
 
 
