@@ -15,7 +15,7 @@ from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import traffic as traffic_model
 from envs.driving import vehicle
-from envs.driving.geometry import box_contact, circle_contact, touches_sidewalk
+from envs.driving.geometry import box_contact, circle_contact, to_body, touches_sidewalk
 from envs.driving.maps import MapSettings, generate
 from envs.driving.recorded import load_recordings
 from envs.driving.scenario import Capacity, Description, Scenario, pack, stack, take
@@ -61,7 +61,7 @@ class DrivingState:
         left, right: Distances to the reference road's edges, m.
         lateral: Lateral offset on the current lane, m.
         traffic: `traffic.Traffic`.
-        touching: [N] bool, traffic vehicles in contact with the ego.
+        blocked: [N] bool, traffic vehicles that touch the ego and have it ahead.
         time: Steps since the start.
     """
 
@@ -72,7 +72,7 @@ class DrivingState:
     right: jax.Array
     lateral: jax.Array
     traffic: traffic_model.Traffic
-    touching: jax.Array
+    blocked: jax.Array
     time: jax.Array
 
 
@@ -86,7 +86,7 @@ class Events(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Overlaps of the ego: depth, m, and direction out, per solid thing."""
+    """Overlaps of the ego: depth, m, and direction out per solid thing; what kinds it touches."""
 
     depth: jax.Array
     out: jax.Array
@@ -229,7 +229,7 @@ class Driving(Environment):
             right=found.right,
             lateral=found.lateral[navigation.lane],
             traffic=traffic,
-            touching=jnp.zeros(traffic.status.shape, bool),
+            blocked=jnp.zeros(traffic.status.shape, bool),
             time=jnp.zeros((), jnp.int32),
         )
 
@@ -243,7 +243,7 @@ class Driving(Environment):
         ego_long, _ = nav.lane_coordinates(lane, state.ego.pose[:2])
         speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
         traffic = traffic_model.advance(
-            scenario, state.traffic, state.navigation.lane, ego_long, speed, state.touching
+            scenario, state.traffic, state.navigation.lane, ego_long, speed, state.blocked
         )
         ego = vehicle.drive(
             state.ego, action, scenario.engine_force, scenario.brake_force,
@@ -272,7 +272,9 @@ class Driving(Environment):
         solid: bool,
     ) -> tuple[DrivingState, Outcome]:
         present = traffic.status != traffic_model.REMOVED
-        touch = contacts(scenario, ego.pose, traffic_model.poses(scenario, traffic), present)
+        traffic_pose = traffic_model.poses(scenario, traffic)
+        touch = contacts(scenario, ego.pose, traffic_pose, present)
+        has_ego_ahead = to_body(ego.pose[:2] - traffic_pose[:, :2], traffic_pose[:, 2])[:, 0] > 0
         if solid:
             ego = _push_out(ego, touch)
         navigation, found = nav.localise(scenario, state.navigation, ego.pose)
@@ -292,7 +294,7 @@ class Driving(Environment):
             right=found.right,
             lateral=found.lateral[navigation.lane],
             traffic=traffic,
-            touching=touch.traffic,
+            blocked=touch.traffic & has_ego_ahead,
             time=time,
         )
         return new_state, Outcome(

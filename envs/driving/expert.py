@@ -132,6 +132,7 @@ def scripted_expert(
     passing = (things.speed < 0.5) & (from_target > reach_side)
     follow = jnp.where(passing, jnp.maximum(follow, CREEP_SPEED), follow)
     wish = jnp.minimum(wish, jnp.min(jnp.where(in_way, follow, jnp.inf)))
+    wish = jnp.minimum(wish, _crossing_limit(scenario, state))
 
     # the throttle or brake that gives the wanted acceleration
     wanted = 2.0 * (wish - speed)
@@ -139,6 +140,25 @@ def scripted_expert(
     brake = 4 * scenario.brake_force / (MASS * SUBSTEP)
     pedal = jnp.where(wanted >= -0.2, wanted / engine, wanted / brake)
     return jnp.clip(jnp.stack([steer, pedal]), -1.0, 1.0)
+
+
+def _crossing_limit(scenario: Scenario, state: DrivingState) -> jax.Array:
+    """Speed allowed by vehicles close ahead that are turning off or crossing, m/s."""
+    traffic, ego = state.traffic, state.ego
+    pose = traffic_model.poses(scenario, traffic)
+    local = to_body(pose[:, :2] - ego.pose[:2], ego.pose[2])
+    same_way = jnp.cos(pose[:, 2] - ego.pose[2])
+    in_front = (
+        (traffic.status != traffic_model.REMOVED)
+        & (local[:, 0] > 0)
+        & (local[:, 0] < 20.0)
+        & (jnp.abs(local[:, 1]) < scenario.traffic.half[:, 1] + _HALF_WIDTH + _SIDE_MARGIN)
+        & (same_way > -0.5)
+    )
+    gap = local[:, 0] - scenario.traffic.half[:, 0] - _HALF_LENGTH
+    pace = traffic.speed * jnp.maximum(same_way, 0.0)
+    allowed = jnp.sqrt(pace**2 + 2 * COMFORT_BRAKING * jnp.maximum(gap - 1.0, 0.0))
+    return jnp.min(jnp.where(in_front, allowed, jnp.inf))
 
 
 def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Things:

@@ -99,7 +99,7 @@ def advance(
         scenario: The map.
         traffic: Before.
         ego_lane, ego_long, ego_speed: Lane index, m along it, m/s.
-        blocked: [N] bool: vehicles in contact with the ego stand still.
+        blocked: [N] bool: vehicles that stand still because they touch the ego ahead of them.
     """
     plan, lanes = scenario.traffic, scenario.lanes
     lane = _lane_index(scenario, traffic)
