@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import flax.struct
 import jax
@@ -13,14 +13,14 @@ PyTree = Any
 
 @flax.struct.dataclass
 class StepInfo:
-    """What a transition tells beside reward and ends; a fixed struct for every world.
+    """What a step tells beside reward and ends; a fixed struct for every world.
 
     Attributes:
         cost: Safety cost of the step, >= 0.
         success: The task was solved in this step.
-        unsafe: A predicted step like this one makes the expert take over (crash, off the road).
+        unsafe: Something that must not happen happened (in driving: a crash, or off the road).
         progress: Share of the task done, in [0, 1].
-        speed: Pace of the step (m/s in driving), for gates on slowness.
+        speed: Pace of the step (m/s in driving).
         final_observation: [O] observation before an automatic reset; the plain one otherwise.
     """
 
@@ -51,18 +51,84 @@ class Outcome:
     speed: jax.Array
 
 
-@runtime_checkable
+@flax.struct.dataclass
+class Trajectory:
+    """A predicted trajectory of H steps, [H].
+
+    Attributes:
+        observation: [H, O] predicted observations, or [0, O] where none were asked for.
+        reward, speed: Of each predicted step.
+        unsafe, success, terminated: Booleans.
+        valid: The step was made: the prediction had not ended before it.
+    """
+
+    observation: jax.Array
+    reward: jax.Array
+    speed: jax.Array
+    unsafe: jax.Array
+    success: jax.Array
+    terminated: jax.Array
+    valid: jax.Array
+
+
+@flax.struct.dataclass
+class Interaction:
+    """One environment step as an algorithm gets to store it.
+
+    Attributes:
+        observation, next_observation: [O]; the latter before any automatic reset.
+        novice_action, expert_action, executed_action: [A].
+        takeover: The expert was in control.
+        takeover_start: It was not in the step before.
+        reward, cost: Scalars.
+        terminated, truncated: Booleans.
+        predicted: First `max_preference_horizon` steps of the novice's held action, from here.
+    """
+
+    observation: jax.Array
+    next_observation: jax.Array
+    novice_action: jax.Array
+    expert_action: jax.Array
+    executed_action: jax.Array
+    takeover: jax.Array
+    takeover_start: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    predicted: Trajectory
+
+
+@flax.struct.dataclass
+class PreferenceBatch:
+    """Preference pairs, [B].
+
+    Attributes:
+        observation: [B, O] (predicted) state.
+        preferred_action, rejected_action: [B, A]: the expert's and the novice's.
+        rejected_observation: [B, O] state of the rejected action where it is another one (the
+            released code's pairs), else [B, 0].
+    """
+
+    observation: jax.Array
+    preferred_action: jax.Array
+    rejected_action: jax.Array
+    rejected_observation: jax.Array
+
+
 class Env(Protocol):
     """A world. All methods are pure; write for one world and `vmap` outside.
 
-    `params` is a traced struct; `default_params` gives the training one. Scenarios are numbered
-    `0 .. params_count - 1`; `reset` draws one, `reset_to` takes one by its index.
+    `params` is a traced struct; `default_params` is for training, `held_out_params` for
+    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`.
     """
 
     name: str
     observation_size: int
     action_size: int
     max_episode_steps: int
+    default_params: PyTree
+    held_out_params: PyTree
 
     def reset(self, key: jax.Array, params: PyTree) -> tuple[jax.Array, PyTree]:
         """A random start: (observation [O], state)."""
@@ -93,9 +159,8 @@ class Env(Protocol):
         ...
 
 
-# An expert proposes an action from the state or the observation; both are pure.
 Expert = Callable[[jax.Array, PyTree, jax.Array, PyTree], jax.Array]
-"""`expert(key, state, observation [O], params) -> action [A]`."""
+"""`expert(key, state, observation [O], params) -> action [A]`; pure."""
 
-Policy = Callable[[PyTree, jax.Array], jax.Array]
-"""`policy(parameters, observation [O]) -> action [A]`, deterministic."""
+Transition = Callable[[jax.Array, PyTree, jax.Array, PyTree], tuple[PyTree, Outcome]]
+"""`transition(key, state, action [A], params) -> (state, outcome)`; pure."""

@@ -1,0 +1,127 @@
+"""Predictive Preference Learning (the paper's Algorithm 1), and its BC-only ablation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.algorithms.base import Algorithm, adam_step, init_adam
+from ppl_jax.buffers import RingBuffer
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.intervention import RULES
+from ppl_jax.losses import Metrics, bc_loss, cpo_loss
+from ppl_jax.networks import make_policy
+from ppl_jax.preference import preference_pairs
+from ppl_jax.types import Interaction, PreferenceBatch, Trajectory
+
+
+@flax.struct.dataclass
+class PPLState:
+    """Parameters, optimiser and the two data sets.
+
+    Attributes:
+        params, opt_state: Of the policy.
+        human_buffer: D_h of (observation [O], expert action [A]).
+        preference_buffer: D_pref of `PreferenceBatch`.
+    """
+
+    params: Any
+    opt_state: Any
+    human_buffer: RingBuffer
+    preference_buffer: RingBuffer
+
+
+def make_ppl(observation_size: int, action_size: int, config: TrainConfig) -> Algorithm:
+    """PPL."""
+    return _make("ppl", observation_size, action_size, config, with_preferences=True)
+
+
+def make_bc_only(observation_size: int, action_size: int, config: TrainConfig) -> Algorithm:
+    """PPL without its preference loss: the same gate, data and cloning loss."""
+    return _make("bc_only", observation_size, action_size, config, with_preferences=False)
+
+
+def _make(
+    name: str, observation_size: int, action_size: int, config: TrainConfig, with_preferences: bool
+) -> Algorithm:
+    policy = make_policy(observation_size, action_size, config.hidden)
+    rule = RULES[config.gate]
+    shifted = config.pair_states == "shifted"
+
+    def init(key: jax.Array) -> PPLState:
+        params = policy.init(key)
+        observation, action = jnp.zeros(observation_size), jnp.zeros(action_size)
+        pair = PreferenceBatch(
+            observation, action, action, observation if shifted else observation[:0]
+        )
+        return PPLState(
+            params=params,
+            opt_state=init_adam(params),
+            human_buffer=buffers.init_buffer(
+                (observation, action), min(config.human_capacity, config.total_steps)
+            ),
+            preference_buffer=buffers.init_buffer(
+                pair, config.preference_capacity if with_preferences else 1
+            ),
+        )
+
+    def act(state: PPLState, observation: jax.Array) -> jax.Array:
+        return policy.apply(state.params, observation)
+
+    def decide(state: PPLState, trajectory: Trajectory, hparams: HParams) -> jax.Array:
+        return rule(trajectory, hparams)
+
+    def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
+        human = buffers.add(
+            state.human_buffer,
+            (step.observation[None], step.expert_action[None]),
+            step.takeover[None],
+        )
+        if not with_preferences:
+            return state.replace(human_buffer=human)
+        pairs, mask = preference_pairs(step, hparams.preference_horizon, config.pair_states)
+        return state.replace(
+            human_buffer=human,
+            preference_buffer=buffers.add(state.preference_buffer, pairs, mask),
+        )
+
+    def loss(
+        params: Any, cloned: Any, pairs: PreferenceBatch, has_pairs: jax.Array, hparams: HParams
+    ) -> tuple[jax.Array, Metrics]:
+        observation, action = cloned
+        # two separate forward passes: XLA runs them side by side on a CPU
+        bc, metrics = bc_loss(policy.apply(params, observation), action, config.bc_reduction)
+        total = hparams.bc_weight * bc
+        if with_preferences:
+            mean = policy.apply(params, pairs.observation)
+            rejected = policy.apply(params, pairs.rejected_observation) if shifted else mean
+            preference, more = cpo_loss(
+                mean, pairs.preferred_action, rejected, pairs.rejected_action, hparams.beta,
+                hparams.preference_bias,
+            )
+            total = total + hparams.preference_weight * has_pairs * preference
+            metrics = metrics | more
+        return total, metrics
+
+    def update(state: PPLState, key: jax.Array, hparams: HParams) -> tuple[PPLState, Metrics]:
+        key_human, key_pairs = jax.random.split(key)
+        cloned = buffers.sample(state.human_buffer, key_human, config.batch_size)
+        pairs = buffers.sample(state.preference_buffer, key_pairs, config.batch_size)
+        has_data = buffers.size(state.human_buffer) > 0
+        has_pairs = buffers.size(state.preference_buffer) > 0
+        grads, metrics = jax.grad(loss, has_aux=True)(
+            state.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
+        )
+        params, opt_state = adam_step(
+            state.params, state.opt_state, grads, hparams.learning_rate, has_data
+        )
+        return state.replace(params=params, opt_state=opt_state), metrics
+
+    def policy_params(state: PPLState) -> Any:
+        return state.params
+
+    return Algorithm(name, init, act, decide, store, update, policy_params, with_preferences)

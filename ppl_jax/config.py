@@ -1,0 +1,164 @@
+"""Settings: `HParams` are traced (changing one compiles nothing), `TrainConfig` is static."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+
+@flax.struct.dataclass
+class HParams:
+    """What a study sweeps: leaves of one pytree, so any of them may carry a batch axis.
+
+    Attributes:
+        preference_horizon: L, number of predicted states that get a preference pair.
+        beta: Temperature of the preference loss. It multiplies log-likelihoods of a Gaussian with
+            variance 1/2 around the policy's action, that is -|a - mu(s)|^2 (see
+            `ppl_jax.distributions`).
+        bc_weight: Weight of the behaviour-cloning loss.
+        preference_weight: Weight of the preference loss; 0 leaves behaviour cloning alone.
+        preference_bias: Factor on the rejected action's likelihood: 1 in the paper, 0.5 in the
+            released code.
+        prediction_noise: epsilon; noise e with |e| = epsilon |s| on predicted observations s.
+        expert_noise: Standard deviation of noise on the expert's action.
+        learning_rate: Of Adam.
+        min_speed: Gate: the expert takes over where the predicted mean speed is below, m/s.
+        min_return: Gate of the released code and of manipulation: where the predicted return is
+            at or below.
+    """
+
+    preference_horizon: jax.Array | float = 4
+    beta: jax.Array | float = 0.1
+    bc_weight: jax.Array | float = 1.0
+    preference_weight: jax.Array | float = 1.0
+    preference_bias: jax.Array | float = 1.0
+    prediction_noise: jax.Array | float = 0.0
+    expert_noise: jax.Array | float = 0.0
+    learning_rate: jax.Array | float = 1e-4
+    min_speed: jax.Array | float = 5.0
+    min_return: jax.Array | float = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """What sets shapes and programs.
+
+    Attributes:
+        total_steps: Environment steps of the run.
+        prediction_horizon: H, steps of the lookahead the expert sees.
+        decision_interval: Steps a decision holds; a new one is made at steps 0, K, 2K, ...
+        max_preference_horizon: Largest L a run may use (L itself is traced).
+        batch_size: Samples per loss and update.
+        hidden: Widths of the policy's hidden layers.
+        human_capacity, preference_capacity: Of the ring buffers; the oldest go first.
+        predictor: The world's own transition, or the rule-based kinematic one.
+        gate: What makes the expert take over: an unsafe or slow prediction, or a low return.
+        gate_rollout: The lookahead holds the proposed action, or asks the policy again at every
+            predicted state.
+        pair_states: Pairs at predicted states 1..L, or as the released code makes them: preferred
+            action at state k, rejected one at state k + 1, k = 0..L-1, 0 being the present.
+        bc_reduction: Squared error summed (the log-likelihood) or averaged over action dimensions.
+        random_steps: Steps at the start in which the novice proposes uniform random actions.
+    """
+
+    total_steps: int = 10_000
+    prediction_horizon: int = 10
+    decision_interval: int = 10
+    max_preference_horizon: int = 10
+    batch_size: int = 256
+    hidden: tuple[int, ...] = (256, 256)
+    human_capacity: int = 50_000
+    preference_capacity: int = 50_000
+    predictor: Literal["simulator", "kinematic"] = "simulator"
+    gate: Literal["unsafe_or_slow", "low_return"] = "unsafe_or_slow"
+    gate_rollout: Literal["constant", "closed_loop"] = "constant"
+    pair_states: Literal["predicted", "shifted"] = "predicted"
+    bc_reduction: Literal["sum", "mean"] = "sum"
+    random_steps: int = 0
+
+
+def paper() -> tuple[TrainConfig, HParams]:
+    """The paper's settings; what it leaves open (network, batch, learning rate) is ours."""
+    return TrainConfig(), HParams()
+
+
+def reference() -> tuple[TrainConfig, HParams]:
+    """The released code's settings (metadriverse/PPL at 7a55c24)."""
+    config = TrainConfig(
+        prediction_horizon=20,
+        decision_interval=10,
+        max_preference_horizon=3,
+        batch_size=1024,
+        predictor="kinematic",
+        gate="low_return",
+        gate_rollout="closed_loop",
+        pair_states="shifted",
+        bc_reduction="mean",
+        random_steps=10,
+    )
+    return config, HParams(preference_horizon=3, preference_bias=0.5, learning_rate=1e-4)
+
+
+PRESETS = {"paper": paper, "reference": reference}
+
+_AT_LEAST_ONE = (
+    "total_steps", "prediction_horizon", "decision_interval", "max_preference_horizon",
+    "batch_size", "human_capacity", "preference_capacity",
+)
+_NOT_NEGATIVE = (
+    "beta", "bc_weight", "preference_weight", "preference_bias", "prediction_noise",
+    "expert_noise", "learning_rate",
+)
+
+
+def validate(config: TrainConfig, hparams: HParams) -> None:
+    """Check settings before anything compiles.
+
+    Args:
+        config: Static settings.
+        hparams: Concrete (not traced) hyper-parameters, scalars or arrays.
+
+    Raises:
+        ValueError: One line naming field, value and what is allowed.
+    """
+    for field in _AT_LEAST_ONE:
+        value = getattr(config, field)
+        if value < 1:
+            raise ValueError(f"{field} must be at least 1, got {value}")
+    if config.total_steps % config.decision_interval:
+        raise ValueError(
+            f"total_steps must be a multiple of decision_interval ({config.decision_interval}), "
+            f"got {config.total_steps}"
+        )
+    if not config.hidden or min(config.hidden) < 1:
+        raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
+    horizon = jnp.asarray(hparams.preference_horizon)
+    if bool(jnp.any(horizon < 1)):
+        raise ValueError(f"preference_horizon must be at least 1, got {_show(horizon)}")
+    if bool(jnp.any(horizon > config.prediction_horizon)):
+        raise ValueError(
+            f"preference_horizon must not exceed prediction_horizon "
+            f"({config.prediction_horizon}), got {_show(horizon)}"
+        )
+    if bool(jnp.any(horizon > config.max_preference_horizon)):
+        raise ValueError(
+            f"preference_horizon must not exceed max_preference_horizon "
+            f"({config.max_preference_horizon}), got {_show(horizon)}"
+        )
+    for field in _NOT_NEGATIVE:
+        value = jnp.asarray(getattr(hparams, field))
+        if not bool(jnp.all(value >= 0)):  # catches NaN too
+            raise ValueError(f"{field} must not be negative, got {_show(value)}")
+
+
+def _show(value: jax.Array) -> Any:
+    return value.item() if value.ndim == 0 else value.tolist()
+
+
+def as_arrays(hparams: HParams) -> HParams:
+    """All leaves as float32 arrays, so that no value changes a program's types."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
