@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,15 @@ from envs.driving import vehicle
 from envs.driving.geometry import box_contact, circle_contact, to_body, touches_sidewalk
 from envs.driving.maps import MapSettings, generate
 from envs.driving.recorded import load_recordings
-from envs.driving.scenario import Capacity, Description, Scenario, pack, stack, take
+from envs.driving.scenario import (
+    SPAWN_LONG,
+    Capacity,
+    Description,
+    Scenario,
+    pack,
+    stack,
+    take,
+)
 from ppl_jax.types import Outcome
 
 TRAINING_SCENARIOS = range(100, 150)
@@ -26,28 +35,6 @@ HELD_OUT_SCENARIOS = range(1000, 1050)
 HORIZON = 1500  # steps of 0.1 s
 CONTACT_MARGIN = 0.04  # m: closer than this counts as touching, as in the simulator
 _HALF = jnp.array(vehicle.HALF_SIZE, jnp.float32)
-
-
-@flax.struct.dataclass
-class DrivingParams:
-    """Traced parameters of the world.
-
-    Attributes:
-        scenarios: Pool with a leading [S] axis.
-        progress_weight, speed_weight: Of the reward's terms (per m; per share of 80 km/h).
-        success_reward, off_road_penalty, crash_penalty: Replace the reward in that step.
-        off_road_cost, crash_vehicle_cost, crash_object_cost: Per step.
-    """
-
-    scenarios: Scenario
-    progress_weight: jax.Array | float = 1.0
-    speed_weight: jax.Array | float = 0.1
-    success_reward: jax.Array | float = 10.0
-    off_road_penalty: jax.Array | float = 5.0
-    crash_penalty: jax.Array | float = 5.0
-    off_road_cost: jax.Array | float = 1.0
-    crash_vehicle_cost: jax.Array | float = 1.0
-    crash_object_cost: jax.Array | float = 1.0
 
 
 @flax.struct.dataclass
@@ -74,6 +61,32 @@ class DrivingState:
     traffic: traffic_model.Traffic
     blocked: jax.Array
     time: jax.Array
+
+
+@flax.struct.dataclass
+class DrivingParams:
+    """Traced parameters of the world.
+
+    Attributes:
+        scenarios: Pool with a leading [S] axis.
+        starts: State at the start of each scenario, [S]; a start is looked up, not computed.
+        start_observations: [S, 259].
+        progress_weight, speed_weight: Of the reward's terms (per m; per share of 80 km/h).
+        success_reward, off_road_penalty, crash_penalty: Replace the reward in that step.
+        off_road_cost, crash_vehicle_cost, crash_object_cost: Per step.
+    """
+
+    scenarios: Scenario
+    starts: DrivingState | None = None
+    start_observations: jax.Array | None = None
+    progress_weight: jax.Array | float = 1.0
+    speed_weight: jax.Array | float = 0.1
+    success_reward: jax.Array | float = 10.0
+    off_road_penalty: jax.Array | float = 5.0
+    crash_penalty: jax.Array | float = 5.0
+    off_road_cost: jax.Array | float = 1.0
+    crash_vehicle_cost: jax.Array | float = 1.0
+    crash_object_cost: jax.Array | float = 1.0
 
 
 class Events(NamedTuple):
@@ -194,6 +207,28 @@ def _push_out(ego: vehicle.Ego, touch: Contacts) -> vehicle.Ego:
     )
 
 
+def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
+    """The ego standing 5 m along its lane, all traffic parked."""
+    lane = take(scenario.lanes, scenario.spawn_lane)
+    long, zero = jnp.float32(SPAWN_LONG), jnp.zeros((), jnp.float32)
+    position = nav.lane_position(lane, long, zero)
+    pose = jnp.append(position, nav.lane_heading(lane, long))
+    ego = vehicle.place(pose, jnp.zeros(2), zero, jnp.zeros(2))
+    navigation, found = nav.localise(scenario, nav.start(scenario), pose)
+    traffic = traffic_model.start(scenario)
+    return DrivingState(
+        scenario=jnp.asarray(index, jnp.int32),
+        ego=ego,
+        navigation=navigation,
+        left=found.left,
+        right=found.right,
+        lateral=found.lateral[navigation.lane],
+        traffic=traffic,
+        blocked=jnp.zeros(traffic.status.shape, bool),
+        time=jnp.zeros((), jnp.int32),
+    )
+
+
 class Driving(Environment):
     """MetaDrive-like driving as pure functions. Build one with `make_driving`."""
 
@@ -213,25 +248,14 @@ class Driving(Environment):
     def reset_to(self, index: jax.Array, key: jax.Array, params: DrivingParams) -> DrivingState:
         """The start of scenario `index` of the pool: standing, 5 m along its lane."""
         del key  # a scenario is deterministic
-        scenario = take(params.scenarios, index)
-        lane = take(scenario.lanes, scenario.spawn_lane)
-        long, zero = jnp.float32(5.0), jnp.zeros((), jnp.float32)
-        position = nav.lane_position(lane, long, zero)
-        pose = jnp.append(position, nav.lane_heading(lane, long))
-        ego = vehicle.place(pose, jnp.zeros(2), zero, jnp.zeros(2))
-        navigation, found = nav.localise(scenario, nav.start(scenario), pose)
-        traffic = traffic_model.start(scenario)
-        return DrivingState(
-            scenario=jnp.asarray(index, jnp.int32),
-            ego=ego,
-            navigation=navigation,
-            left=found.left,
-            right=found.right,
-            lateral=found.lateral[navigation.lane],
-            traffic=traffic,
-            blocked=jnp.zeros(traffic.status.shape, bool),
-            time=jnp.zeros((), jnp.int32),
-        )
+        return take(params.starts, index)
+
+    def reset(
+        self, key: jax.Array, params: DrivingParams
+    ) -> tuple[jax.Array, DrivingState]:
+        """A random scenario's start."""
+        index = jax.random.randint(key, (), 0, self.scenario_count(params))
+        return params.start_observations[index], take(params.starts, index)
 
     def transition(
         self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
@@ -311,17 +335,27 @@ class Driving(Environment):
 
     def observe(self, state: DrivingState, params: DrivingParams) -> jax.Array:
         """The 259 values (see `envs.driving.observation`)."""
-        scenario = take(params.scenarios, state.scenario)
-        features = obs.ego_features(
-            scenario, state.ego, state.navigation, state.left, state.right, state.lateral
-        )
-        rays = obs.lidar_reading(
-            scenario,
-            state.ego.pose,
-            traffic_model.poses(scenario, state.traffic),
-            state.traffic.status != traffic_model.REMOVED,
-        )
-        return jnp.concatenate([features, rays])
+        return observe(take(params.scenarios, state.scenario), state)
+
+
+def observe(scenario: Scenario, state: DrivingState) -> jax.Array:
+    """The 259 values of a state in its scenario."""
+    features = obs.ego_features(
+        scenario, state.ego, state.navigation, state.left, state.right, state.lateral
+    )
+    rays = obs.lidar_reading(
+        scenario,
+        state.ego.pose,
+        traffic_model.poses(scenario, state.traffic),
+        state.traffic.status != traffic_model.REMOVED,
+    )
+    return jnp.concatenate([features, rays])
+
+
+@jax.jit
+def _starts(pool: Scenario) -> tuple[DrivingState, jax.Array]:
+    states = jax.vmap(start_state)(pool, jnp.arange(pool.number.shape[0]))
+    return states, jax.vmap(observe)(pool, states)
 
 
 def make_params(
@@ -335,13 +369,17 @@ def make_params(
     if not descriptions:
         raise ValueError("a driving world needs at least one scenario")
     capacity = capacity or Capacity.of(descriptions)
-    pool = stack([pack(description, capacity) for description in descriptions])
+    packed = stack([pack(description, capacity) for description in descriptions])
+    pool = jax.tree.map(jnp.asarray, packed)
+    starts, observations = _starts(pool)
     weights = {
-        field: jnp.float32(value.default)
-        for field, value in DrivingParams.__dataclass_fields__.items()
-        if field != "scenarios"
+        field.name: jnp.float32(field.default)
+        for field in dataclasses.fields(DrivingParams)
+        if isinstance(field.default, float)
     }
-    return DrivingParams(scenarios=jax.tree.map(jnp.asarray, pool), **weights)
+    return DrivingParams(
+        scenarios=pool, starts=starts, start_observations=observations, **weights
+    )
 
 
 def make_driving(

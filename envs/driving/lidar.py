@@ -26,20 +26,26 @@ def box_distances(pose: jax.Array, boxes: jax.Array, half: jax.Array) -> jax.Arr
         half: [K, 2] half length and half width, m.
     """
     relative = pose[2] - boxes[:, 2]
-    c, s = jnp.cos(relative)[:, None], jnp.sin(relative)[:, None]
-    along = c * _DIRECTIONS[0] - s * _DIRECTIONS[1]  # ray directions in each box's frame, [K, R]
-    across = s * _DIRECTIONS[0] + c * _DIRECTIONS[1]
+    c, s = jnp.cos(relative), jnp.sin(relative)
     offset = pose[:2] - boxes[:, :2]
     ch, sh = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
-    x = (ch * offset[:, 0] + sh * offset[:, 1])[:, None]
-    y = (-sh * offset[:, 0] + ch * offset[:, 1])[:, None]
-    inverse_along = 1.0 / jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
-    inverse_across = 1.0 / jnp.where(jnp.abs(across) < 1e-9, 1e-9, across)
-    reach_x, reach_y = half[:, :1] * jnp.abs(inverse_along), half[:, 1:] * jnp.abs(inverse_across)
-    middle_x, middle_y = -x * inverse_along, -y * inverse_across
-    enter = jnp.maximum(middle_x - reach_x, middle_y - reach_y)
-    leave = jnp.minimum(middle_x + reach_x, middle_y + reach_y)
-    return jnp.min(jnp.where((enter <= leave) & (enter >= 0), enter, _MISS), 0)
+    x = ch * offset[:, 0] + sh * offset[:, 1]
+    y = -sh * offset[:, 0] + ch * offset[:, 1]
+    nearest = jnp.full(RAYS, _MISS)
+    # unrolled: XLA then keeps the rays in vector registers (15 times faster for a single world)
+    for k in range(boxes.shape[0]):
+        along = c[k] * _DIRECTIONS[0] - s[k] * _DIRECTIONS[1]  # ray directions in the box's frame
+        across = s[k] * _DIRECTIONS[0] + c[k] * _DIRECTIONS[1]
+        inverse_along = 1.0 / jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
+        inverse_across = 1.0 / jnp.where(jnp.abs(across) < 1e-9, 1e-9, across)
+        reach_x = half[k, 0] * jnp.abs(inverse_along)
+        reach_y = half[k, 1] * jnp.abs(inverse_across)
+        middle_x, middle_y = -x[k] * inverse_along, -y[k] * inverse_across
+        enter = jnp.maximum(middle_x - reach_x, middle_y - reach_y)
+        leave = jnp.minimum(middle_x + reach_x, middle_y + reach_y)
+        hit = (enter <= leave) & (enter >= 0)
+        nearest = jnp.minimum(nearest, jnp.where(hit, enter, _MISS))
+    return nearest
 
 
 def circle_distances(pose: jax.Array, circles: jax.Array) -> jax.Array:
@@ -51,13 +57,18 @@ def circle_distances(pose: jax.Array, circles: jax.Array) -> jax.Array:
     """
     offset = circles[:, :2] - pose[:2]
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    x = (c * offset[:, 0] + s * offset[:, 1])[:, None]
-    y = (-s * offset[:, 0] + c * offset[:, 1])[:, None]
-    along = x * _DIRECTIONS[0] + y * _DIRECTIONS[1]
-    across = x * _DIRECTIONS[1] - y * _DIRECTIONS[0]
-    inside = circles[:, 2:] ** 2 - across**2
-    enter = along - jnp.sqrt(jnp.maximum(inside, 0.0))
-    return jnp.min(jnp.where((inside >= 0) & (enter >= 0), enter, _MISS), 0)
+    x = c * offset[:, 0] + s * offset[:, 1]
+    y = -s * offset[:, 0] + c * offset[:, 1]
+    square = circles[:, 2] ** 2
+    nearest = jnp.full(RAYS, _MISS)
+    for k in range(circles.shape[0]):
+        along = x[k] * _DIRECTIONS[0] + y[k] * _DIRECTIONS[1]
+        across = x[k] * _DIRECTIONS[1] - y[k] * _DIRECTIONS[0]
+        inside = square[k] - across * across
+        enter = along - jnp.sqrt(jnp.maximum(inside, 0.0))
+        hit = (inside >= 0) & (enter >= 0)
+        nearest = jnp.minimum(nearest, jnp.where(hit, enter, _MISS))
+    return nearest
 
 
 def scan(pose: jax.Array, boxes: jax.Array, half: jax.Array, circles: jax.Array) -> jax.Array:

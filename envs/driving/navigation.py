@@ -13,6 +13,7 @@ from envs.driving.geometry import (
     lane_heading,
     lane_position,
     on_lanes,
+    runs_along,
 )
 from envs.driving.scenario import Scenario, take
 
@@ -75,7 +76,7 @@ def localise(
     lanes = scenario.lanes
     long, lateral = lane_coordinates(lanes, pose[:2])
     inside = on_lanes(lanes, long, lateral)
-    along = jnp.cos(lane_heading(lanes, long) - pose[2]) > 0
+    along = runs_along(lanes, pose)
     distance = (
         jnp.abs(lateral) + jnp.maximum(long - lanes.length, 0.0) + jnp.maximum(-long, 0.0)
     )
