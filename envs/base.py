@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import Outcome, StepInfo
+from ppl_jax.types import Outcome, StepInfo, WorldSpec
 
 
 class Environment:
@@ -17,8 +17,7 @@ class Environment:
     """
 
     name: str
-    observation_size: int
-    action_size: int
+    spec: WorldSpec
     max_episode_steps: int
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: Any) -> Any:

@@ -9,6 +9,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.types import WorldSpec
+
 Params = Any
 
 
@@ -35,15 +37,16 @@ class PolicyNetwork(NamedTuple):
     apply: Callable[[Params, jax.Array], jax.Array]
 
 
-def make_policy(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> PolicyNetwork:
-    """An MLP with ReLU between layers and tanh at the end."""
-    module = _MLP(tuple(hidden), action_size)
+def make_policy(spec: WorldSpec, hidden: tuple[int, ...]) -> PolicyNetwork:
+    """An MLP with ReLU between layers and tanh at the end; its input is centred and scaled."""
+    module = _MLP(tuple(hidden), spec.action_size)
+    mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
 
     def init(key: jax.Array) -> Params:
-        return module.init(key, jnp.zeros(observation_size))
+        return module.init(key, jnp.zeros(spec.observation_size))
 
     def apply(params: Params, observation: jax.Array) -> jax.Array:
-        return module.apply(params, observation)  # pyright: ignore[reportReturnType]
+        return module.apply(params, (observation - mean) / scale)  # pyright: ignore[reportReturnType]
 
     return PolicyNetwork(init, apply)
 

@@ -107,7 +107,7 @@ def make_train(
         ValueError: If the world lacks the predictor that `config` names.
     """
     params = env.default_params if env_params is None else env_params
-    algorithm = make_algorithm(env.observation_size, env.action_size, config)
+    algorithm = make_algorithm(env.spec, config)
     transition = selected_transition(env, config.predictor)
     interval = config.decision_interval
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
+import numpy as np
 
 PyTree = Any
 
@@ -116,6 +117,21 @@ class PreferenceBatch:
     rejected_observation: jax.Array
 
 
+class WorldSpec(NamedTuple):
+    """What a network has to know of a world.
+
+    Attributes:
+        observation_size, action_size: O and A.
+        observation_mean, observation_scale: [O] constants of the world; a network sees
+            `(observation - mean) / scale`.
+    """
+
+    observation_size: int
+    action_size: int
+    observation_mean: np.ndarray
+    observation_scale: np.ndarray
+
+
 class Env(Protocol):
     """A world. All methods are pure; write for one world and `vmap` outside.
 
@@ -124,8 +140,7 @@ class Env(Protocol):
     """
 
     name: str
-    observation_size: int
-    action_size: int
+    spec: WorldSpec
     max_episode_steps: int
     default_params: PyTree
     held_out_params: PyTree

@@ -16,7 +16,7 @@ from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import traffic as traffic_model
 from envs.driving import vehicle
-from envs.driving.geometry import box_contact, circle_contact, to_body, touches_sidewalk
+from envs.driving.geometry import box_contact, circle_depth, to_body, touches_sidewalk
 from envs.driving.maps import MapSettings, generate
 from envs.driving.recorded import load_recordings
 from envs.driving.scenario import (
@@ -28,12 +28,13 @@ from envs.driving.scenario import (
     stack,
     take,
 )
-from ppl_jax.types import Outcome
+from ppl_jax.types import Expert, Outcome, WorldSpec
 
 TRAINING_SCENARIOS = range(100, 150)
 HELD_OUT_SCENARIOS = range(1000, 1050)
 HORIZON = 1500  # steps of 0.1 s
 CONTACT_MARGIN = 0.04  # m: closer than this counts as touching, as in the simulator
+_COASTING = 0.364  # m/s^2: 4 wheels, 2 N s per 0.02 s, 1100 kg
 _HALF = jnp.array(vehicle.HALF_SIZE, jnp.float32)
 
 
@@ -48,6 +49,7 @@ class DrivingState:
         left, right: Distances to the reference road's edges, m.
         lateral: Lateral offset on the current lane, m.
         traffic: `traffic.Traffic`.
+        box_pose, box_velocity: [K, 3], [K, 2] of the boxes: broken-down vehicles can be pushed.
         blocked: [N] bool, traffic vehicles that touch the ego and have it ahead.
         time: Steps since the start.
     """
@@ -59,6 +61,8 @@ class DrivingState:
     right: jax.Array
     lateral: jax.Array
     traffic: traffic_model.Traffic
+    box_pose: jax.Array
+    box_velocity: jax.Array
     blocked: jax.Array
     time: jax.Array
 
@@ -99,7 +103,14 @@ class Events(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Overlaps of the ego: depth, m, and direction out per solid thing; what kinds it touches."""
+    """What the ego touches.
+
+    Attributes:
+        depth, out: [N + K] overlap with each traffic vehicle and box, m, and [N + K, 2] the
+            direction out of it.
+        traffic: [N] bool.
+        vehicle, object: Whether it touches any vehicle, any object.
+    """
 
     depth: jax.Array
     out: jax.Array
@@ -109,26 +120,26 @@ class Contacts(NamedTuple):
 
 
 def contacts(
-    scenario: Scenario, pose: jax.Array, traffic_pose: jax.Array, present: jax.Array
+    scenario: Scenario,
+    pose: jax.Array,
+    traffic_pose: jax.Array,
+    present: jax.Array,
+    box_pose: jax.Array,
 ) -> Contacts:
     """What the ego touches at `pose` [3]."""
     objects = scenario.objects
-    boxes = jnp.concatenate(
-        [jnp.where(present[:, None], traffic_pose, 1e6), objects.box_pose]
-    )
+    boxes = jnp.concatenate([jnp.where(present[:, None], traffic_pose, 1e6), box_pose])
     half = jnp.concatenate([scenario.traffic.half, objects.box_half])
-    box_depth, box_out = box_contact(pose, _HALF, boxes, half)
-    circle_depth, circle_out = circle_contact(pose, _HALF, objects.circle)
+    depth, out = box_contact(pose, _HALF, boxes, half)
     n = present.shape[0]
-    hit = box_depth > -CONTACT_MARGIN
-    hit_object = hit[n:]
+    hit, hit_box = depth[:n] > -CONTACT_MARGIN, depth[n:] > -CONTACT_MARGIN
+    hit_circle = circle_depth(pose, _HALF, objects.circle) > -CONTACT_MARGIN
     return Contacts(
-        depth=jnp.concatenate([box_depth, circle_depth]),
-        out=jnp.concatenate([box_out, circle_out]),
-        traffic=hit[:n],
-        vehicle=jnp.any(hit[:n]) | jnp.any(hit_object & objects.box_is_vehicle),
-        object=jnp.any(hit_object & ~objects.box_is_vehicle)
-        | jnp.any(circle_depth > -CONTACT_MARGIN),
+        depth=depth,
+        out=out,
+        traffic=hit,
+        vehicle=jnp.any(hit) | jnp.any(hit_box & objects.box_is_vehicle),
+        object=jnp.any(hit_box & ~objects.box_is_vehicle) | jnp.any(hit_circle),
     )
 
 
@@ -187,24 +198,48 @@ def reward_and_cost(
     return reward, cost
 
 
-def _push_out(ego: vehicle.Ego, touch: Contacts) -> vehicle.Ego:
-    """Let the ego not pass through the deepest thing it overlaps.
+def push(
+    scenario: Scenario,
+    ego: vehicle.Ego,
+    traffic: traffic_model.Traffic,
+    traffic_pose: jax.Array,
+    box_pose: jax.Array,
+    box_velocity: jax.Array,
+    touch: Contacts,
+) -> tuple[vehicle.Ego, traffic_model.Traffic, jax.Array, jax.Array]:
+    """What a contact does: ego and the vehicle it runs into go on at their common speed.
 
-    It is moved out and loses its velocity into the thing. The physics engine's bounces and spins
-    are not modelled.
+    As in the simulator, where a car that hits a standing one loses half its speed and pushes it
+    along, while cones, triangles and barriers do not hold it up at all. Both vehicles are taken
+    to weigh the same; spin is not modelled.
+
+    Returns:
+        Ego, traffic, box poses, box velocities.
     """
-    worst = jnp.argmax(touch.depth)
-    depth = jnp.maximum(touch.depth[worst], 0.0)
+    n = traffic_pose.shape[0]
+    heading = jnp.stack([jnp.cos(traffic_pose[:, 2]), jnp.sin(traffic_pose[:, 2])], -1)
+    velocity = jnp.concatenate([traffic.speed[:, None] * heading, box_velocity])
+    is_vehicle = jnp.concatenate([jnp.ones(n, bool), scenario.objects.box_is_vehicle])
+    depth = jnp.where(is_vehicle, jnp.maximum(touch.depth, 0.0), 0.0)
+    worst = jnp.argmax(depth)
     out = touch.out[worst]
-    into = jnp.minimum(jnp.sum(ego.velocity * out), 0.0)
-    hit = depth > 0
-    shift = jnp.append(depth * out, 0.0)
-    return ego.replace(
-        pose=ego.pose + shift,
-        body=ego.body + shift,
-        velocity=jnp.where(hit, ego.velocity - into * out, ego.velocity),
-        yaw_rate=jnp.where(hit, 0.5 * ego.yaw_rate, ego.yaw_rate),
+    closing = jnp.minimum(jnp.sum((ego.velocity - velocity[worst]) * out), 0.0)
+    exchange = jnp.where(depth[worst] > 0, 0.5 * closing, 0.0) * out
+    ego = ego.replace(velocity=ego.velocity - exchange)
+    struck = (jnp.arange(depth.shape[0]) == worst) & (depth[worst] > 0)
+    hit = struck[:, None].astype(jnp.float32)
+    moved = velocity + hit * exchange
+    shift = -hit * depth[worst] * out
+    traffic = traffic.replace(
+        speed=jnp.maximum(jnp.sum(moved[:n] * heading, -1), 0.0),
+        long=traffic.long + jnp.sum(shift[:n] * heading, -1),
     )
+    # a pushed wreck rolls on and slows as a car does that coasts
+    rolling = moved[n:]
+    pace = jnp.sqrt(jnp.sum(rolling**2, -1, keepdims=True) + 1e-12)
+    rolling = rolling * jnp.maximum(1.0 - _COASTING * vehicle.CONTROL_STEP / pace, 0.0)
+    place = box_pose.at[:, :2].add(shift[n:] + vehicle.CONTROL_STEP * rolling)
+    return ego, traffic, place, rolling
 
 
 def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
@@ -224,6 +259,8 @@ def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
         right=found.right,
         lateral=found.lateral[navigation.lane],
         traffic=traffic,
+        box_pose=scenario.objects.box_pose,
+        box_velocity=jnp.zeros_like(scenario.objects.box_pose[:, :2]),
         blocked=jnp.zeros(traffic.status.shape, bool),
         time=jnp.zeros((), jnp.int32),
     )
@@ -233,13 +270,23 @@ class Driving(Environment):
     """MetaDrive-like driving as pure functions. Build one with `make_driving`."""
 
     name = "driving"
-    observation_size = obs.SIZE
-    action_size = 2
+    spec = WorldSpec(obs.SIZE, 2, obs.MEAN, obs.SCALE)
     max_episode_steps = HORIZON
 
     def __init__(self, default_params: DrivingParams, held_out_params: DrivingParams):
         self.default_params = default_params
         self.held_out_params = held_out_params
+
+    @property
+    def scripted_expert(self) -> Expert:
+        """The world's default expert."""
+        from envs.driving.expert import scripted_expert
+
+        return scripted_expert
+
+    def scenario_numbers(self, params: DrivingParams) -> jax.Array:
+        """Numbers of the pool's scenarios, [S]."""
+        return params.scenarios.number
 
     def scenario_count(self, params: DrivingParams) -> int:
         """Number of scenarios in the pool."""
@@ -297,10 +344,13 @@ class Driving(Environment):
     ) -> tuple[DrivingState, Outcome]:
         present = traffic.status != traffic_model.REMOVED
         traffic_pose = traffic_model.poses(scenario, traffic)
-        touch = contacts(scenario, ego.pose, traffic_pose, present)
+        touch = contacts(scenario, ego.pose, traffic_pose, present, state.box_pose)
         has_ego_ahead = to_body(ego.pose[:2] - traffic_pose[:, :2], traffic_pose[:, 2])[:, 0] > 0
+        box_pose, box_velocity = state.box_pose, state.box_velocity
         if solid:
-            ego = _push_out(ego, touch)
+            ego, traffic, box_pose, box_velocity = push(
+                scenario, ego, traffic, traffic_pose, box_pose, box_velocity, touch
+            )
         navigation, found = nav.localise(scenario, state.navigation, ego.pose)
         events = Events(
             arrived=nav.arrived(scenario, navigation, found),
@@ -318,6 +368,8 @@ class Driving(Environment):
             right=found.right,
             lateral=found.lateral[navigation.lane],
             traffic=traffic,
+            box_pose=box_pose,
+            box_velocity=box_velocity,
             blocked=touch.traffic & has_ego_ahead,
             time=time,
         )
@@ -348,6 +400,7 @@ def observe(scenario: Scenario, state: DrivingState) -> jax.Array:
         state.ego.pose,
         traffic_model.poses(scenario, state.traffic),
         state.traffic.status != traffic_model.REMOVED,
+        state.box_pose,
     )
     return jnp.concatenate([features, rays])
 

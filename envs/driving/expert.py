@@ -143,20 +143,26 @@ def scripted_expert(
 
 
 def _crossing_limit(scenario: Scenario, state: DrivingState) -> jax.Array:
-    """Speed allowed by vehicles close ahead that are turning off or crossing, m/s."""
-    traffic, ego = state.traffic, state.ego
-    pose = traffic_model.poses(scenario, traffic)
+    """Speed allowed by vehicles close ahead that turn off or cross, and by pushed wrecks, m/s."""
+    traffic, ego, objects = state.traffic, state.ego, scenario.objects
+    pose = jnp.concatenate([traffic_model.poses(scenario, traffic), state.box_pose])
+    half = jnp.concatenate([scenario.traffic.half, objects.box_half])
+    wreck_speed = jnp.sqrt(jnp.sum(state.box_velocity**2, -1))
+    speed = jnp.concatenate([traffic.speed, wreck_speed])
+    there = jnp.concatenate(
+        [traffic.status != traffic_model.REMOVED, objects.box_is_vehicle & (wreck_speed > 0.1)]
+    )
     local = to_body(pose[:, :2] - ego.pose[:2], ego.pose[2])
     same_way = jnp.cos(pose[:, 2] - ego.pose[2])
     in_front = (
-        (traffic.status != traffic_model.REMOVED)
+        there
         & (local[:, 0] > 0)
         & (local[:, 0] < 20.0)
-        & (jnp.abs(local[:, 1]) < scenario.traffic.half[:, 1] + _HALF_WIDTH + _SIDE_MARGIN)
+        & (jnp.abs(local[:, 1]) < half[:, 1] + _HALF_WIDTH + _SIDE_MARGIN)
         & (same_way > -0.5)
     )
-    gap = local[:, 0] - scenario.traffic.half[:, 0] - _HALF_LENGTH
-    pace = traffic.speed * jnp.maximum(same_way, 0.0)
+    gap = local[:, 0] - half[:, 0] - _HALF_LENGTH
+    pace = speed * jnp.maximum(same_way, 0.0)
     allowed = jnp.sqrt(pace**2 + 2 * COMFORT_BRAKING * jnp.maximum(gap - 1.0, 0.0))
     return jnp.min(jnp.where(in_front, allowed, jnp.inf))
 
@@ -180,8 +186,12 @@ def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Th
         _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, objects.along]))
         - ego_along
     )
+    # a wreck that was pushed away is not where the lane says; `_crossing_limit` minds it
+    strayed = jnp.sum((state.box_pose - objects.box_pose)[:, :2] ** 2, -1) > 0.25
+    vehicles, circles = traffic.status.shape[0], objects.circle.shape[0]
+    strayed = jnp.pad(strayed, (vehicles, circles))
     return Things(
-        ahead=jnp.where(route >= 0, ahead, jnp.inf),
+        ahead=jnp.where((route >= 0) & ~strayed, ahead, jnp.inf),
         lateral=jnp.concatenate([offset, objects.across]),
         half_length=half[:, 0],
         half_width=half[:, 1],

@@ -112,10 +112,6 @@ def _edges(scenario: Scenario, lane: jax.Array, road: jax.Array, pose: jax.Array
     return long, lateral, left, scenario.route_size[road] * width - left
 
 
-def _with_boxes(scenario: Scenario, boxes: jax.Array) -> Scenario:
-    return scenario.replace(objects=scenario.objects.replace(box_pose=boxes))
-
-
 @jax.jit
 @jax.vmap
 def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
@@ -126,8 +122,7 @@ def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
             lateral[lane],
         )
         traffic_pose = traffic[:, :3].at[:, :2].add(SEEN_AHEAD * traffic[:, 3:5])
-        there = _with_boxes(scenario, boxes)
-        rays = obs.lidar_reading(there, ego[:3], traffic_pose, traffic[:, 5] > 0)
+        rays = obs.lidar_reading(scenario, ego[:3], traffic_pose, traffic[:, 5] > 0, boxes)
         return jnp.concatenate([features, rays])
 
     return jax.vmap(one)(ego, before, action, lane, road, traffic, boxes)
@@ -144,8 +139,7 @@ def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
         found = nav.Localised(long, lateral, on_lane, left, right)
         navigation = _navigation(lane, road)
         state = _ego(ego, before, action)
-        there = _with_boxes(scenario, boxes)
-        touch = driving.contacts(there, ego[:3], traffic[:, :3], traffic[:, 5] > 0)
+        touch = driving.contacts(scenario, ego[:3], traffic[:, :3], traffic[:, 5] > 0, boxes)
         events = driving.Events(
             nav.arrived(scenario, navigation, found),
             driving.off_road(found, scenario, ego[:3]),

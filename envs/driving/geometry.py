@@ -172,31 +172,13 @@ def box_contact(
     return jnp.min(depths, -1), axis * sign
 
 
-def circle_contact(
-    pose: jax.Array, half: jax.Array, circles: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Overlap of a rectangle with circles.
+def circle_depth(pose: jax.Array, half: jax.Array, circles: jax.Array) -> jax.Array:
+    """Overlap of a rectangle with circles, m, positive when they overlap, [C].
 
     Args:
         pose, half: [3] and [2].
         circles: [C, 3] x, y, radius.
-
-    Returns:
-        Depth [C] (m, positive when they overlap) and the direction out of the circle, [C, 2].
     """
-    local = to_body(circles[:, :2] - pose[:2], pose[2])
-    closest = jnp.clip(local, -half, half)
-    gap = closest - local
-    distance = jnp.sqrt(jnp.sum(gap * gap, -1) + 1e-12)
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    inside = jnp.all(jnp.abs(local) < half, -1)
-    # a circle whose centre is inside is left across the rectangle's long sides
-    out = jnp.where(
-        inside[:, None], jnp.stack([0 * local[:, 0], -jnp.sign(local[:, 1])], -1),
-        gap / distance[:, None],
-    )
-    depth = jnp.where(
-        inside, circles[:, 2] + half[1] - jnp.abs(local[:, 1]), circles[:, 2] - distance
-    )
-    world = jnp.stack([c * out[:, 0] - s * out[:, 1], s * out[:, 0] + c * out[:, 1]], -1)
-    return depth, world
+    local = jnp.abs(to_body(circles[:, :2] - pose[:2], pose[2]))
+    gap = jnp.maximum(local - half, 0.0)
+    return circles[:, 2] - jnp.sqrt(jnp.sum(gap * gap, -1))

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.driving import lidar
 from envs.driving.geometry import lane_position, to_body, wrap
@@ -27,6 +28,10 @@ from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import CONTROL_STEP, Ego
 
 SIZE = 19 + lidar.RAYS
+# a network sees (observation - MEAN) / SCALE: no ray hit is 0, and the few numbers that tell the
+# car's place on the road vary as much as the rays do
+MEAN = np.concatenate([np.full(19, 0.5), np.ones(lidar.RAYS)]).astype(np.float32)
+SCALE = np.concatenate([np.full(19, 0.25), np.full(lidar.RAYS, 1.0)]).astype(np.float32)
 _FULL_WIDTH = 18.0  # m: (3 + 1) lanes of 4.5 m
 _WIDEST_LANE = 4.5  # m
 _CHECKPOINT_RANGE = 50.0  # m
@@ -100,7 +105,11 @@ def ego_features(
 
 
 def lidar_reading(
-    scenario: Scenario, pose: jax.Array, traffic_pose: jax.Array, present: jax.Array
+    scenario: Scenario,
+    pose: jax.Array,
+    traffic_pose: jax.Array,
+    present: jax.Array,
+    box_pose: jax.Array,
 ) -> jax.Array:
     """Values 19-258.
 
@@ -109,12 +118,13 @@ def lidar_reading(
         pose: [3] of the ego.
         traffic_pose: [N, 3].
         present: [N] bool: vehicles still in the world.
+        box_pose: [K, 3] of the static boxes.
     """
     objects = scenario.objects
     away = jnp.where(present[:, None], traffic_pose, 1e6)
     return lidar.scan(
         pose,
-        jnp.concatenate([away, objects.box_pose]),
+        jnp.concatenate([away, box_pose]),
         jnp.concatenate([scenario.traffic.half, objects.box_half]),
         objects.circle,
     )

@@ -11,7 +11,7 @@ import optax
 
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics
-from ppl_jax.types import Interaction, Trajectory
+from ppl_jax.types import Interaction, Trajectory, WorldSpec
 
 PyTree = Any
 
@@ -41,8 +41,8 @@ class Algorithm(NamedTuple):
     uses_predictions: bool
 
 
-MakeAlgorithm = Callable[[int, int, TrainConfig], Algorithm]
-"""`make(observation_size, action_size, config) -> Algorithm`."""
+MakeAlgorithm = Callable[[WorldSpec, TrainConfig], Algorithm]
+"""`make(spec, config) -> Algorithm`."""
 
 _ADAM = optax.scale_by_adam()
 

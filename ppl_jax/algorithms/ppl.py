@@ -16,7 +16,7 @@ from ppl_jax.intervention import RULES
 from ppl_jax.losses import Metrics, bc_loss, cpo_loss
 from ppl_jax.networks import make_policy
 from ppl_jax.preference import preference_pairs
-from ppl_jax.types import Interaction, PreferenceBatch, Trajectory
+from ppl_jax.types import Interaction, PreferenceBatch, Trajectory, WorldSpec
 
 
 @flax.struct.dataclass
@@ -35,26 +35,26 @@ class PPLState:
     preference_buffer: RingBuffer
 
 
-def make_ppl(observation_size: int, action_size: int, config: TrainConfig) -> Algorithm:
+def make_ppl(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     """PPL."""
-    return _make("ppl", observation_size, action_size, config, with_preferences=True)
+    return _make("ppl", spec, config, with_preferences=True)
 
 
-def make_bc_only(observation_size: int, action_size: int, config: TrainConfig) -> Algorithm:
+def make_bc_only(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     """PPL without its preference loss: the same gate, data and cloning loss."""
-    return _make("bc_only", observation_size, action_size, config, with_preferences=False)
+    return _make("bc_only", spec, config, with_preferences=False)
 
 
 def _make(
-    name: str, observation_size: int, action_size: int, config: TrainConfig, with_preferences: bool
+    name: str, spec: WorldSpec, config: TrainConfig, with_preferences: bool
 ) -> Algorithm:
-    policy = make_policy(observation_size, action_size, config.hidden)
+    policy = make_policy(spec, config.hidden)
     rule = RULES[config.gate]
     shifted = config.pair_states == "shifted"
 
     def init(key: jax.Array) -> PPLState:
         params = policy.init(key)
-        observation, action = jnp.zeros(observation_size), jnp.zeros(action_size)
+        observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
         pair = PreferenceBatch(
             observation, action, action, observation if shifted else observation[:0]
         )

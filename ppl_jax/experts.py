@@ -1,0 +1,54 @@
+"""Experts as pure functions: a saved policy as an expert. Scripted ones live with their worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ppl_jax.types import Expert
+
+
+class SavedPolicy(NamedTuple):
+    """A policy as plain arrays: what an exported file holds.
+
+    Attributes:
+        weights: (w [I, O], b [O]) per layer: `x @ w + b`.
+        activation: Between layers: "relu" or "tanh".
+        output: Of the last layer: "tanh" squashes it, "clip" clips it to [-1, 1].
+        obs_mean, obs_scale: `(obs - mean) / scale` comes first.
+    """
+
+    weights: Sequence[tuple[Any, Any]]
+    activation: str
+    output: str
+    obs_mean: Any
+    obs_scale: Any
+
+
+def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
+    """The deterministic action, [..., O] -> [..., A]."""
+    x = (observation - policy.obs_mean) / policy.obs_scale
+    between = jnp.tanh if policy.activation == "tanh" else jax.nn.relu
+    for w, b in policy.weights[:-1]:
+        x = between(x @ w + b)
+    w, b = policy.weights[-1]
+    x = x @ w + b
+    return jnp.tanh(x) if policy.output == "tanh" else jnp.clip(x, -1.0, 1.0)
+
+
+def neural_expert(policy: SavedPolicy) -> Expert:
+    """An expert that acts as a saved policy does."""
+    arrays = jax.tree.map(
+        jnp.asarray, (list(policy.weights), policy.obs_mean, policy.obs_scale)
+    )
+    weights, mean, scale = arrays
+    policy = policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
+
+    def expert(key: jax.Array, state: Any, observation: jax.Array, params: Any) -> jax.Array:
+        del key, state, params
+        return act(policy, observation)
+
+    return expert

@@ -1,0 +1,109 @@
+"""The run folder: config.json, metrics.jsonl, evaluation.csv, summary.json, checkpoints/."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+CONFIG, METRICS, EVALUATION, SUMMARY, CHECKPOINTS, POLICY = (
+    "config.json", "metrics.jsonl", "evaluation.csv", "summary.json", "checkpoints", "policy.npz",
+)
+
+
+class RunFolder:
+    """A run's files. Text is written whole or appended line by line, never left half changed."""
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / CHECKPOINTS
+
+    def create(self, config: dict[str, Any]) -> None:
+        """Make the folder and write config.json.
+
+        Raises:
+            ValueError: If the folder already holds a run.
+            OSError: If it cannot be written.
+        """
+        if (self.path / CONFIG).exists():
+            raise ValueError(
+                f"out folder {str(self.path)!r} already holds a run: give --resume to go on with "
+                "it, or another --out"
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.write_json(CONFIG, config)
+
+    def config(self) -> dict[str, Any]:
+        """Read config.json.
+
+        Raises:
+            ValueError: If the folder is not a run folder.
+        """
+        try:
+            return json.loads((self.path / CONFIG).read_text())
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"{str(self.path)!r} is not a run folder: it has no readable {CONFIG}"
+            ) from error
+
+    def write_json(self, name: str, content: Any) -> None:
+        """Replace a JSON file in one step."""
+        part = self.path / f"{name}.part"
+        part.write_text(json.dumps(content, indent=2) + "\n")
+        os.replace(part, self.path / name)
+
+    def read_json(self, name: str) -> Any:
+        """Read a JSON file of the folder."""
+        return json.loads((self.path / name).read_text())
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Append one line to metrics.jsonl."""
+        with open(self.path / METRICS, "a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def append_evaluation(self, rows: list[dict[str, Any]]) -> None:
+        """Append rows to evaluation.csv (with a header when new)."""
+        path = self.path / EVALUATION
+        new = not path.exists()
+        with open(path, "a", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            if new:
+                writer.writeheader()
+            writer.writerows(rows)
+
+    def rewind(self, step: int) -> None:
+        """Drop what was logged after `step`: a resumed run writes it again."""
+        metrics = self.path / METRICS
+        if metrics.exists():
+            kept = []
+            for line in metrics.read_text().splitlines():
+                try:
+                    row = json.loads(line)
+                except ValueError:  # the line that was being written when the run was killed
+                    continue
+                if row["step"] <= step:
+                    kept.append(line + "\n")
+            _replace(metrics, "".join(kept))
+        evaluation = self.path / EVALUATION
+        if evaluation.exists():
+            lines = evaluation.read_text().splitlines(keepends=True)
+            header = lines[:1]
+            columns = header[0].strip().split(",") if header else []
+            kept = header
+            for line in lines[1:]:
+                cells = line.strip().split(",")
+                if len(cells) == len(columns) and int(cells[columns.index("step")]) <= step:
+                    kept.append(line)
+            _replace(evaluation, "".join(kept))
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(text)
+    os.replace(part, path)
