@@ -345,7 +345,8 @@ class Driving(Environment):
         present = traffic.status != traffic_model.REMOVED
         traffic_pose = traffic_model.poses(scenario, traffic)
         touch = contacts(scenario, ego.pose, traffic_pose, present, state.box_pose)
-        has_ego_ahead = to_body(ego.pose[:2] - traffic_pose[:, :2], traffic_pose[:, 2])[:, 0] > 0
+        local = to_body(ego.pose[:2] - traffic_pose[:, :2], traffic_pose[:, 2])
+        has_ego_ahead = (local[:, 0] > 0) & (jnp.abs(local[:, 1]) < vehicle.HALF_SIZE[1])
         box_pose, box_velocity = state.box_pose, state.box_velocity
         if solid:
             ego, traffic, box_pose, box_velocity = push(

@@ -17,7 +17,7 @@ from envs.driving.scenario import SIDEWALK, Description, ObjectSpec, VehicleSpec
 
 ENGINE_FORCE, BRAKE_FORCE, WHEEL_FRICTION = (750.0, 850.0), (80.0, 180.0), 0.9
 VEHICLE_GAP = 10.0  # m between places where traffic may start
-_TRIALS = 8  # draws of a block before the one before it is drawn again
+_TRIALS = 5  # draws of a block's parameters before the block before it is drawn again
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,26 +106,28 @@ def generate(number: int, settings: MapSettings | None = None) -> Description:
 def _draw_blocks(
     rng: np.random.Generator, settings: MapSettings
 ) -> tuple[list[Block], RoadNetwork]:
-    """Blocks that do not cross one another, and the network they make."""
+    """Blocks that do not cross one another, and the network they make.
+
+    As in MetaDrive's search, a block that crosses keeps its kind and socket and has its parameters
+    drawn again, five times at most; then the block before it is drawn again.
+    """
     kinds = [kind for kind in BLOCK_KINDS if kind in settings.kinds]
     weights = np.array([BLOCK_KINDS[kind].probability for kind in kinds])
     start = first_block(settings.lanes, settings.lane_width)
     blocks, networks = [start], [start.network]
-    failures = 0
     while len(blocks) <= settings.blocks:
         kind = BLOCK_KINDS[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]
         entry = blocks[-1].sockets[rng.integers(len(blocks[-1].sockets))]
-        block = kind.build(networks[-1], entry, len(blocks), kind.draw(rng))
-        if not _crosses(networks[-1], block.network):
-            blocks.append(block)
-            networks.append(networks[-1].merged(block.network))
-            failures = 0
-            continue
-        failures += 1
-        if failures >= _TRIALS and len(blocks) > 1:
-            blocks.pop()
-            networks.pop()
-            failures = 0
+        for _ in range(_TRIALS):
+            block = kind.build(networks[-1], entry, len(blocks), kind.draw(rng))
+            if not _crosses(networks[-1], block.network):
+                blocks.append(block)
+                networks.append(networks[-1].merged(block.network))
+                break
+        else:
+            if len(blocks) > 1:
+                blocks.pop()
+                networks.pop()
     return blocks, networks[-1]
 
 
@@ -137,9 +139,9 @@ def _crosses(base: RoadNetwork, new: RoadNetwork) -> bool:
             continue
         for lane in lanes:
             longs = np.arange(1.0, lane.length - 0.5, 1.0)
-            offsets = [0.0, lane.width / 2 + (SIDEWALK[1] if lane.kerb else -0.1)]
-            points += [lane.position(long, offset) for long in longs for offset in offsets]
-    cloud = np.array(points)
+            edge = lane.width / 2 + (SIDEWALK[1] if lane.kerb else -0.1)
+            points += [lane.positions(longs, 0.0), lane.positions(longs, edge)]
+    cloud = np.concatenate(points)
     return any(lane.contains(cloud).any() for lanes in base.roads.values() for lane in lanes)
 
 

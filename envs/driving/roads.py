@@ -54,13 +54,17 @@ class Lane:
 
     def position(self, long: float, lateral: float) -> np.ndarray:
         """World position of the point (`long`, `lateral`), m, shape [2]."""
+        return self.positions(np.array([long]), lateral)[0]
+
+    def positions(self, longs: np.ndarray, lateral: float) -> np.ndarray:
+        """World positions of many points at one lateral, [N] -> [N, 2]."""
         if self.turn == 0:
             forward = (self.end - self.start) / self.length
-            return self.start + long * forward + lateral * np.array([forward[1], -forward[0]])
-        phi = self.turn * long / self.radius + self.phase
-        return self.center + (self.radius + lateral * self.turn) * np.array(
-            [np.cos(phi), np.sin(phi)]
-        )
+            right = np.array([forward[1], -forward[0]])
+            return self.start + longs[:, None] * forward + lateral * right
+        phi = self.turn * longs / self.radius + self.phase
+        circle = np.stack([np.cos(phi), np.sin(phi)], -1)
+        return self.center + (self.radius + lateral * self.turn) * circle
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(long, lateral) of world points, shapes [..., 2] -> [...], [...]."""
