@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,11 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import make
+from experiments.policy_file import load_policy
+from experiments.runtime import UserError
 from ppl_jax import experts
 from ppl_jax.evaluation import Episodes, make_evaluate
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.runlog import EVALUATION
-from ppl_jax.types import Env
+from ppl_jax.runlog import EVALUATION, POLICY, RunFolder
+from ppl_jax.types import Env, WorldSpec
 
 
 class EvaluationRow(NamedTuple):
@@ -89,3 +93,65 @@ def read_evaluation(run: Path) -> list[EvaluationRow]:
             )
             for row in csv.DictReader(file)
         ]
+
+
+def policy_path(run: Path) -> Path:
+    """The policy file of a run folder, or the file itself.
+
+    Raises:
+        UserError: If there is none.
+    """
+    if run.is_file():
+        return run
+    path = run / POLICY
+    if not path.is_file():
+        raise UserError(f"{str(run)!r} is neither a run folder with a policy nor a policy file")
+    return path
+
+
+def run_options(run: Path) -> tuple[str, dict[str, Any]]:
+    """The world of a run folder (or of a policy file's meta) and how it was built."""
+    if run.is_file():
+        try:
+            with np.load(run, allow_pickle=False) as archive:
+                return json.loads(str(archive["meta"]))["env"], {}
+        except (OSError, KeyError, ValueError) as error:
+            raise UserError(f"policy file {str(run)!r} cannot be read: {error}") from error
+    try:
+        config = RunFolder(run).config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    names = ("scenarios", "held_out_scenarios")
+    return config["env"], {name: config[name] for name in names if config[name] is not None}
+
+
+def run_spec(run: Path) -> WorldSpec:
+    """Sizes of a run's world."""
+    env, _ = run_options(run)
+    return make_world(env, {}).spec
+
+
+def make_world(name: str, options: dict[str, Any]) -> Env:
+    """Build a world; a mistake becomes a `UserError`."""
+    try:
+        return make(name, **options)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
+    """Play a run's held-out scenarios, or those of a folder of recordings, once.
+
+    Raises:
+        UserError: If run, policy or folder cannot be used.
+    """
+    source = policy_path(run)
+    name, options = run_options(run)
+    if scenarios is not None:
+        options = {"held_out_scenarios": scenarios}
+    env = make_world(name, options)
+    try:
+        policy = load_policy(source, env.spec.observation_size, env.spec.action_size)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return evaluate_policy(env, policy, 0)

@@ -13,8 +13,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs import make, registered
-from experiments.evaluate import EvaluationRow, evaluate_policy, summarise_episodes
+from envs import registered
+from experiments.evaluate import (
+    evaluate_policy,
+    make_world,
+    read_evaluation,
+    summarise_episodes,
+)
 from experiments.policy_file import load_policy, save_policy
 from experiments.progress import Progress
 from experiments.runtime import UserError, device, revision, versions
@@ -123,10 +128,10 @@ def build(settings: RunSettings) -> tuple[Env, Expert]:
         for name in ("scenarios", "held_out_scenarios")
         if (value := getattr(settings, name)) is not None
     }
+    env = make_world(settings.env, options)
+    if settings.expert == "scripted":
+        return env, env.scripted_expert
     try:
-        env = make(settings.env, **options)
-        if settings.expert == "scripted":
-            return env, env.scripted_expert
         policy = load_policy(settings.expert, env.spec.observation_size, env.spec.action_size)
     except ValueError as error:
         raise UserError(str(error)) from error
@@ -285,8 +290,8 @@ class _Runner:
     def finish(self, learner: Learner, wall_s: float) -> dict[str, Any]:
         """Write and return the summary."""
         settings = self.settings
-        last = _last_evaluation(self.folder, settings.config.total_steps)
-        scores = summarise_episodes(last)
+        rows = read_evaluation(self.folder.path)
+        scores = summarise_episodes([r for r in rows if r.step == settings.config.total_steps])
         human = int(learner.counters.human_data)
         summary = {
             "env": settings.env,
@@ -306,8 +311,3 @@ class _Runner:
         self.folder.write_json(SUMMARY, summary)
         return summary
 
-
-def _last_evaluation(folder: RunFolder, step: int) -> list[EvaluationRow]:
-    from experiments.evaluate import read_evaluation
-
-    return [row for row in read_evaluation(folder.path) if row.step == step]

@@ -1,0 +1,284 @@
+"""The `ppl` command."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, subcommand
+
+from experiments.runtime import UserError
+
+
+@dataclasses.dataclass
+class Train:
+    """Train one policy: progress, then the evaluation table; a run folder."""
+
+    env: Positional[str]
+    """World: driving."""
+    algorithm: str = "ppl"
+    """Method: ppl, or bc_only (PPL without its preference loss)."""
+    seed: int = 0
+    """Random seed."""
+    preset: Literal["paper", "reference"] = "paper"
+    """Settings to start from: the paper's, or the released code's."""
+    total_steps: int | None = None
+    """Environment steps."""
+    preference_horizon: int | None = None
+    """L: predicted states that get a preference pair."""
+    prediction_horizon: int | None = None
+    """H: steps of the lookahead the expert sees."""
+    beta: float | None = None
+    """Temperature of the preference loss."""
+    bc_weight: float | None = None
+    """Weight of the behaviour-cloning loss."""
+    preference_weight: float | None = None
+    """Weight of the preference loss."""
+    prediction_noise: float | None = None
+    """epsilon: noise of norm epsilon |s| on predicted states."""
+    expert_noise: float | None = None
+    """Standard deviation of noise on the expert's actions."""
+    learning_rate: float | None = None
+    """Of Adam."""
+    min_speed: float | None = None
+    """Gate: predicted mean speed below which the expert takes over, m/s."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    predictor: Literal["simulator", "kinematic"] | None = None
+    """The world's own transition, or the rule-based bicycle with traffic frozen."""
+    expert: str = "scripted"
+    """The scripted expert, or a policy file (.npz)."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
+    evaluate_every: int = 1000
+    """Steps between evaluations and checkpoints."""
+    out: Path | None = None
+    """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
+    resume: bool = False
+    """Go on with the run in --out."""
+
+
+@dataclasses.dataclass
+class Evaluate:
+    """Play every held-out scenario once with a trained policy."""
+
+    run: Positional[Path]
+    """Run folder, or an exported policy file."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to play instead of the run's own held-out ones."""
+    out: Path | None = None
+    """Write one row per scenario to this CSV file."""
+
+
+@dataclasses.dataclass
+class Compare:
+    """Train several methods with the same seeds; one table."""
+
+    env: Positional[str]
+    """World: driving."""
+    algorithms: tuple[str, ...] = ("ppl", "bc_only")
+    """Methods."""
+    seeds: int = 5
+    """Seeds 0, 1, ..., each method the same."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on."""
+    processes: int = 2
+    """Runs at the same time."""
+    out: Path = Path("compare")
+    """Folder of the runs and of results.csv; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Export:
+    """Write a run's policy as one file that plain NumPy can run."""
+
+    run: Positional[Path]
+    """Run folder."""
+    out: Path = Path("policy.npz")
+    """File to write."""
+
+
+@dataclasses.dataclass
+class Render:
+    """Draw one episode of a policy as GIF, MP4 or PNG (the file's ending decides)."""
+
+    run: Positional[str]
+    """Run folder, policy file, or "scripted"."""
+    scenario: int = 1000
+    """Number of a held-out scenario."""
+    out: Path = Path("episode.gif")
+    """File to write."""
+    steps: int = 600
+    """At most so many steps."""
+
+
+@dataclasses.dataclass
+class Bench:
+    """Measure speed, as ratios within one run."""
+
+    repeats: int = 5
+    """Repeats of each figure; medians are reported."""
+    out: Path | None = None
+    """Also write the figures to this JSON file."""
+
+
+@dataclasses.dataclass
+class Doctor:
+    """Say what this machine has, and what to do about what is missing."""
+
+
+Command = (
+    Annotated[Train, subcommand("train")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Compare, subcommand("compare")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Bench, subcommand("bench")]
+    | Annotated[Doctor, subcommand("doctor")]
+)
+
+
+def run_settings(command: Train):
+    """Turn the command line into settings of a run."""
+    from experiments.train import RunSettings
+    from ppl_jax.config import PRESETS
+
+    config, hparams = PRESETS[command.preset]()
+    given = {
+        name: value for name, value in dataclasses.asdict(command).items() if value is not None
+    }
+    static = {f.name: given[f.name] for f in dataclasses.fields(config) if f.name in given}
+    if "prediction_horizon" in static:
+        static["max_preference_horizon"] = max(
+            1, min(config.max_preference_horizon, static["prediction_horizon"])
+        )
+    traced = {f.name: given[f.name] for f in dataclasses.fields(hparams) if f.name in given}
+    horizon = traced.get("preference_horizon", 0)
+    final = dataclasses.replace(config, **static)
+    if horizon <= final.prediction_horizon:
+        wider = max(final.max_preference_horizon, horizon)
+        final = dataclasses.replace(final, max_preference_horizon=wider)
+    return RunSettings(
+        env=command.env, algorithm=command.algorithm, seed=command.seed,
+        config=final, hparams=hparams.replace(**traced),
+        expert=command.expert, scenarios=command.scenarios,
+        held_out_scenarios=command.held_out_scenarios, evaluate_every=command.evaluate_every,
+    )
+
+
+def _train(command: Train) -> None:
+    from experiments.runtime import start_jax
+    from experiments.tables import print_run
+    from experiments.train import check, train
+
+    settings = run_settings(command)
+    every = min(settings.evaluate_every, max(settings.config.total_steps, 1))
+    settings = dataclasses.replace(settings, evaluate_every=every)
+    check(settings)
+    if command.resume and command.out is None:
+        raise UserError("--resume needs --out, the run folder to go on with")
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{command.env}-{command.algorithm}-{command.seed}-{stamp}"
+    out = command.out or Path("runs") / name
+    start_jax()
+    train(settings, out, command.resume)
+    print_run(out)
+
+
+def _evaluate(command: Evaluate) -> None:
+    from experiments.evaluate import evaluate_run
+    from experiments.runtime import start_jax
+    from experiments.tables import print_evaluation
+
+    start_jax()
+    rows = evaluate_run(command.run, command.scenarios)
+    if command.out is not None:
+        from experiments.tables import write_rows
+
+        write_rows(command.out, [row._asdict() for row in rows])
+    print_evaluation(str(command.run), rows)
+
+
+def _compare(command: Compare) -> None:
+    from experiments.compare import compare
+    from experiments.tables import print_comparison
+
+    compare(command)
+    print_comparison(command.out / "results.csv")
+
+
+def _export(command: Export) -> None:
+    import shutil
+
+    from experiments.evaluate import policy_path, run_spec
+    from experiments.policy_file import load_policy
+
+    source = policy_path(command.run)
+    spec = run_spec(command.run)
+    try:
+        load_policy(source, spec.observation_size, spec.action_size)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    shutil.copyfile(source, command.out)
+    print(f"wrote {command.out}")
+
+
+def _render(command: Render) -> None:
+    from experiments.render import render
+    from experiments.runtime import start_jax
+
+    start_jax()
+    render(command.run, command.scenario, command.out, command.steps)
+    print(f"wrote {command.out}")
+
+
+def _bench(command: Bench) -> None:
+    from experiments.bench import bench
+    from experiments.runtime import start_jax
+
+    start_jax()
+    bench(command.repeats, command.out)
+
+
+def _doctor(command: Doctor) -> None:
+    from experiments.doctor import doctor
+
+    doctor()
+
+
+_ACTIONS = {
+    Train: _train, Evaluate: _evaluate, Compare: _compare, Export: _export, Render: _render,
+    Bench: _bench, Doctor: _doctor,
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
+    command = tyro.cli(
+        Command, prog="ppl", args=argv, description=__doc__
+    )
+    try:
+        _ACTIONS[type(command)](command)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("interrupted; what was saved is kept", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

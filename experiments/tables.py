@@ -1,0 +1,120 @@
+"""Tables, from result files only."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.evaluate import EvaluationRow, read_evaluation, summarise_episodes
+from ppl_jax.runlog import SUMMARY, RunFolder
+from ppl_jax.statistics import Interval, mean_interval, paired_difference
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A plain table with aligned columns."""
+    table = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    for i, row in enumerate(table):
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        if i == 0:
+            print("  ".join("-" * width for width in widths))
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write dictionaries as a CSV file."""
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def print_run(run: Path) -> None:
+    """The evaluation table of a run folder, one line per evaluation."""
+    folder = RunFolder(run)
+    config, summary = folder.config(), folder.read_json(SUMMARY)
+    rows = read_evaluation(run)
+    human = {}
+    with open(run / "evaluation.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            human[int(row["step"])] = int(row["human_data_usage"])
+    lines = []
+    for step in sorted({row.step for row in rows}):
+        scores = summarise_episodes([row for row in rows if row.step == step])
+        lines.append([
+            str(step), str(human[step]), f"{scores['success_rate']:.2f}",
+            f"{scores['route_completion']:.2f}", f"{scores['episodic_return']:.0f}",
+            f"{scores['episodic_cost']:.2f}", f"{scores['episode_length']:.0f}",
+        ])
+    print(f"\n{config['algorithm']} on {config['env']}, seed {config['seed']}: "
+          f"{summary['episodes']} held-out scenarios, each played once, without the expert")
+    print_table(
+        ["step", "human data", "success", "route", "return", "cost", "length"], lines
+    )
+    print(f"\n{summary['wall_s']:.0f} s in all, {summary['compile_s']:.0f} s of it compiling; "
+          f"the run folder is {run}")
+
+
+def print_evaluation(name: str, rows: list[EvaluationRow]) -> None:
+    """One policy's evaluation with intervals over scenarios."""
+    print(f"{name}: {len(rows)} scenarios, each once")
+    rng = np.random.default_rng(0)
+
+    def cell(values: list[float], digits: int) -> str:
+        return show(mean_interval(np.array([values]), rng), digits)
+
+    print_table(
+        ["success", "route", "return", "cost", "length"],
+        [[
+            cell([row.success for row in rows], 2), cell([row.progress for row in rows], 2),
+            cell([row.episodic_return for row in rows], 0),
+            cell([row.episodic_cost for row in rows], 2), cell([row.length for row in rows], 0),
+        ]],
+    )
+
+
+def show(interval: Interval, digits: int) -> str:
+    """`mean [low, high]`."""
+    return f"{interval.mean:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
+
+
+def print_comparison(path: Path) -> None:
+    """Methods side by side at their last evaluation, 95% intervals over seeds and scenarios."""
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    last = max(int(row["step"]) for row in rows)
+    rows = [row for row in rows if int(row["step"]) == last]
+    algorithms = list(dict.fromkeys(row["algorithm"] for row in rows))
+    rng = np.random.default_rng(0)
+
+    def scores(algorithm: str, column: str) -> np.ndarray:
+        mine = [row for row in rows if row["algorithm"] == algorithm]
+        seeds = sorted({int(row["seed"]) for row in mine})
+        return np.array(
+            [[float(row[column]) for row in mine if int(row["seed"]) == seed] for seed in seeds]
+        )
+
+    lines = []
+    for algorithm in algorithms:
+        human = scores(algorithm, "human_data_usage")[:, 0]
+        lines.append([
+            algorithm, str(len(human)), f"{human.mean():.0f} ({human.mean() / last:.2f})",
+            str(last),
+            *[
+                show(mean_interval(scores(algorithm, column), rng), digits)
+                for column, digits in (
+                    ("success", 2), ("progress", 2), ("episodic_return", 0), ("episodic_cost", 2),
+                )
+            ],
+        ])
+    print_table(
+        ["method", "seeds", "human data", "steps", "success", "route", "return", "cost"], lines
+    )
+    for other in algorithms[1:]:
+        first = scores(algorithms[0], "success")
+        if first.shape == scores(other, "success").shape:
+            gap = paired_difference(first, scores(other, "success"), rng)
+            print(f"success of {algorithms[0]} less {other}, paired: {show(gap, 2)}")
