@@ -18,7 +18,7 @@ from envs.driving.geometry import lane_coordinates, lane_position, to_body
 from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
 
-CRUISE_SPEED = 14.0  # m/s
+CRUISE_SPEED = 12.0  # m/s
 LATERAL_ACCELERATION = 3.5  # m/s^2, allowed in bends
 COMFORT_BRAKING = 3.0  # m/s^2, when slowing for a bend or an object
 CREEP_SPEED = 1.5  # m/s, to steer round something from standstill
@@ -27,7 +27,8 @@ SIGHT = 60.0  # m along the route
 LANES = 5  # lane numbers looked at
 _HALF_LENGTH, _HALF_WIDTH = HALF_SIZE
 _SIDE_MARGIN = 0.35  # m kept beside things
-_LANE_CHANGE_COST, _EDGE_COST = 6.0, 4.0  # m of free road a lane change, an outer lane is worth
+# what a lane change, an outer lane and passing on the right are worth, m of free road
+_LANE_CHANGE_COST, _EDGE_COST, _RIGHT_COST = 6.0, 12.0, 3.0
 _PREVIEW = 0.25  # s: the yaw rate follows the wheel that much later
 
 
@@ -135,7 +136,7 @@ def scripted_expert(
     wish = jnp.minimum(wish, _crossing_limit(scenario, state))
 
     # the throttle or brake that gives the wanted acceleration
-    wanted = 2.0 * (wish - speed)
+    wanted = 1.2 * (wish - speed)
     engine = 4 * scenario.engine_force / MASS
     brake = 4 * scenario.brake_force / (MASS * SUBSTEP)
     pedal = jnp.where(wanted >= -0.2, wanted / engine, wanted / brake)
@@ -228,6 +229,7 @@ def _choose_lane(
     value = jnp.minimum(free, SIGHT) - _LANE_CHANGE_COST * jnp.abs(number - here)
     edge = (number == 0) | (number == usable - 1)
     value = value - jnp.where(edge & (usable > 2), _EDGE_COST, 0.0)
+    value = value - _RIGHT_COST * (number > here)
     value = jnp.where(number < usable, value, value - 200.0)
     # a lane beyond an occupied neighbour is out of reach
     step = jnp.sign(number - current)

@@ -28,10 +28,10 @@ from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import CONTROL_STEP, Ego
 
 SIZE = 19 + lidar.RAYS
-# a network sees (observation - MEAN) / SCALE: no ray hit is 0, and the few numbers that tell the
-# car's place on the road vary as much as the rays do
+# a network sees (observation - MEAN) / SCALE: a ray that hits nothing is 0, and the few numbers that
+# tell the place on the road weigh more than the many rays
 MEAN = np.concatenate([np.full(19, 0.5), np.ones(lidar.RAYS)]).astype(np.float32)
-SCALE = np.concatenate([np.full(19, 0.25), np.full(lidar.RAYS, 1.0)]).astype(np.float32)
+SCALE = np.concatenate([np.full(19, 0.1), np.full(lidar.RAYS, 3.0)]).astype(np.float32)
 _FULL_WIDTH = 18.0  # m: (3 + 1) lanes of 4.5 m
 _WIDEST_LANE = 4.5  # m
 _CHECKPOINT_RANGE = 50.0  # m
