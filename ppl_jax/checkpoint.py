@@ -65,7 +65,7 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
     part = folder / f"{_PREFIX}{step}.part"
     for path in (final, part):
         shutil.rmtree(path, ignore_errors=True)
-    _orbax().save_pytree((part / "learner").absolute(), tree)
+    _orbax().save((part / "learner").absolute(), tree)
     record = {"schema": SCHEMA, "step": step, "crc32": _checksum(tree)}
     (part / _CHECKSUM).write_text(json.dumps(record))
     part.rename(final)
@@ -87,7 +87,7 @@ def restore(
         path = folder / f"{_PREFIX}{step}"
         try:
             record = json.loads((path / _CHECKSUM).read_text())
-            tree = _orbax().load_pytree((path / "learner").absolute(), _abstract(like))
+            tree = _orbax().load((path / "learner").absolute(), _abstract(like))
             if record["crc32"] != _checksum(tree):
                 raise ValueError("its contents do not match its checksum")
         except Exception as error:  # whatever a damaged file makes Orbax raise

@@ -16,9 +16,8 @@ class HParams:
 
     Attributes:
         preference_horizon: L, number of predicted states that get a preference pair.
-        beta: Temperature of the preference loss. It multiplies log-likelihoods of a Gaussian with
-            variance 1/2 around the policy's action, that is -|a - mu(s)|^2 (see
-            `ppl_jax.distributions`).
+        beta: Temperature of the preference loss. It multiplies the log-likelihoods that
+            `TrainConfig.likelihood` names (see `ppl_jax.distributions`).
         bc_weight: Weight of the behaviour-cloning loss.
         preference_weight: Weight of the preference loss; 0 leaves behaviour cloning alone.
         preference_bias: Factor on the rejected action's likelihood: 1 in the paper, 0.5 in the
@@ -61,6 +60,7 @@ class TrainConfig:
             predicted state.
         pair_states: Pairs at predicted states 1..L, or as the released code makes them: preferred
             action at state k, rejected one at state k + 1, k = 0..L-1, 0 being the present.
+        likelihood: Which log pi the losses mean (see `ppl_jax.distributions`).
         bc_reduction: Squared error summed (the log-likelihood) or averaged over action dimensions.
         random_steps: Steps at the start in which the novice proposes uniform random actions.
     """
@@ -77,6 +77,7 @@ class TrainConfig:
     gate: Literal["unsafe_or_slow", "low_return"] = "unsafe_or_slow"
     gate_rollout: Literal["constant", "closed_loop"] = "constant"
     pair_states: Literal["predicted", "shifted"] = "predicted"
+    likelihood: Literal["laplace", "gaussian"] = "laplace"
     bc_reduction: Literal["sum", "mean"] = "sum"
     random_steps: int = 0
 
@@ -97,6 +98,7 @@ def reference() -> tuple[TrainConfig, HParams]:
         gate="low_return",
         gate_rollout="closed_loop",
         pair_states="shifted",
+        likelihood="gaussian",
         bc_reduction="mean",
         random_steps=10,
     )

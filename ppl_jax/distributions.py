@@ -1,13 +1,22 @@
 """The likelihood that the losses and `beta` refer to.
 
-A policy outputs mu(s) in [-1, 1]^A. Its action distribution for learning is a Gaussian in action
-space with fixed variance 1/2 around mu(s), so that up to a constant that cancels
+A policy outputs mu(s) in [-1, 1]^A; the paper does not say which density around it its log pi means,
+and `beta` means nothing without one. Two are offered; constants that cancel are left out.
 
-    log pi(a | s) = -|a - mu(s)|^2
+`laplace` (default): log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.1. A smoothed
+multivariate Laplace density: quadratic within w of mu (there it is a Gaussian of standard deviation
+0.1), linear beyond. What matters is the linear tail. Along the line from a- through a+ it makes
 
-This is the surrogate of the released code. It is finite with finite gradients everywhere on the
-action box, its corners included, where the expert's clipped actions lie. A Gaussian with standard
-deviation sigma in its place would be the same as multiplying `beta` by 1 / (2 sigma^2).
+    log pi(a+|s) - log pi(a-|s)
+
+stop growing once mu has reached a+, so the paper's preference loss has its optimum there.
+
+`gaussian`: log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate. With it that
+difference is linear in mu: the loss has no optimum inside the action box and pushes mu past a+ to
+a corner, unless the rejected term is scaled down (the released code's 0.5).
+
+Both are finite with finite gradients everywhere on the action box, its corners included, where the
+expert's clipped actions lie. Another b is the same as `beta` divided by it.
 """
 
 from __future__ import annotations
@@ -15,7 +24,18 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+LAPLACE_SCALE = 0.1  # b
+LAPLACE_CORE = 0.1  # w
 
-def log_likelihood(mean: jax.Array, action: jax.Array) -> jax.Array:
-    """log pi(action | mean) up to a constant, [..., A], [..., A] -> [...]."""
-    return -jnp.sum((action - mean) ** 2, -1)
+
+def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "laplace") -> jax.Array:
+    """log pi(action | mean) up to a constant, [..., A], [..., A] -> [...].
+
+    Args:
+        mean, action: In [-1, 1].
+        kind: "laplace" or "gaussian".
+    """
+    square = jnp.sum((action - mean) ** 2, -1)
+    if kind == "gaussian":
+        return -square
+    return -(jnp.sqrt(square + LAPLACE_CORE**2) - LAPLACE_CORE) / LAPLACE_SCALE

@@ -18,17 +18,21 @@ Metrics = dict[str, jax.Array]
 
 
 def bc_loss(
-    mean: jax.Array, expert_action: jax.Array, reduction: str = "sum"
+    mean: jax.Array,
+    expert_action: jax.Array,
+    likelihood: str = "laplace",
+    reduction: str = "sum",
 ) -> tuple[jax.Array, Metrics]:
     """Behaviour cloning: -E[log pi(a_h|s)].
 
     Args:
         mean: [B, A] policy actions.
         expert_action: [B, A].
+        likelihood: See `ppl_jax.distributions`.
         reduction: "sum" over action dimensions (the log-likelihood), or "mean" (the released
             code's mean squared error).
     """
-    loss = -jnp.mean(log_likelihood(mean, expert_action))
+    loss = -jnp.mean(log_likelihood(mean, expert_action, likelihood))
     if reduction == "mean":
         loss = loss / mean.shape[-1]
     return loss, {"loss_bc": loss}
@@ -41,6 +45,7 @@ def cpo_loss(
     rejected_action: jax.Array,
     beta: jax.Array | float,
     bias: jax.Array | float = 1.0,
+    likelihood: str = "laplace",
 ) -> tuple[jax.Array, Metrics]:
     """Contrastive preference loss: -E[log sigmoid(beta (log pi(a+|s) - bias log pi(a-|s)))].
 
@@ -51,9 +56,10 @@ def cpo_loss(
         beta: Temperature.
         bias: 1 in the paper; 0.5 in the released code, where -bias is the "contrastive bias" of
             contrastive preference learning.
+        likelihood: See `ppl_jax.distributions`.
     """
-    preferred = log_likelihood(preferred_mean, preferred_action)
-    rejected = log_likelihood(rejected_mean, rejected_action)
+    preferred = log_likelihood(preferred_mean, preferred_action, likelihood)
+    rejected = log_likelihood(rejected_mean, rejected_action, likelihood)
     loss = -jnp.mean(jax.nn.log_sigmoid(beta * (preferred - bias * rejected)))
     return loss, {
         "loss_preference": loss,

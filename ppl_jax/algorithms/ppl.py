@@ -94,14 +94,16 @@ def _make(
     ) -> tuple[jax.Array, Metrics]:
         observation, action = cloned
         # two separate forward passes: XLA runs them side by side on a CPU
-        bc, metrics = bc_loss(policy.apply(params, observation), action, config.bc_reduction)
+        bc, metrics = bc_loss(
+            policy.apply(params, observation), action, config.likelihood, config.bc_reduction
+        )
         total = hparams.bc_weight * bc
         if with_preferences:
             mean = policy.apply(params, pairs.observation)
             rejected = policy.apply(params, pairs.rejected_observation) if shifted else mean
             preference, more = cpo_loss(
                 mean, pairs.preferred_action, rejected, pairs.rejected_action, hparams.beta,
-                hparams.preference_bias,
+                hparams.preference_bias, config.likelihood,
             )
             total = total + hparams.preference_weight * has_pairs * preference
             metrics = metrics | more

@@ -1,0 +1,31 @@
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+CACHE = Path(__file__).parent.parent / ".pytest_cache" / "xla"
+RECORDINGS = Path(__file__).parent.parent.parent / "shared" / "data" / "metadrive"
+
+
+def pytest_configure(config):
+    CACHE.mkdir(parents=True, exist_ok=True)
+    os.environ["PPL_JAX_CACHE"] = str(CACHE)
+    jax.config.update("jax_compilation_cache_dir", str(CACHE))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@pytest.fixture(scope="session")
+def recordings():
+    """Folder of recorded MetaDrive scenarios; tests that need it skip without it."""
+    if not RECORDINGS.is_dir():
+        pytest.skip("the MetaDrive recordings (../shared/data/metadrive) are not here")
+    return RECORDINGS
+
+
+@pytest.fixture(scope="session")
+def world():
+    """A small driving world that tests share, so that compiled functions are shared too."""
+    from envs.driving.env import make_driving
+
+    return make_driving(training=range(100, 106), held_out=range(1000, 1006))

@@ -1,0 +1,69 @@
+"""Probe worlds with known answers, as small as they can be."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Environment
+from ppl_jax.types import Outcome, WorldSpec
+
+
+@flax.struct.dataclass
+class ProbeState:
+    sign: jax.Array  # +1 or -1: what the observation shows
+    error: jax.Array  # how far the executed actions have led astray
+    time: jax.Array
+
+
+@flax.struct.dataclass
+class ProbeParams:
+    signs: jax.Array
+
+
+class Probe(Environment):
+    """The right action is `0.6 * sign`; others add up to an unsafe deviation.
+
+    `dependent=False` shows the same observation always (sign +1): the answer is a constant.
+    """
+
+    name = "probe"
+    max_episode_steps = 20
+    tolerance = 0.15
+
+    def __init__(self, dependent=True):
+        signs = jnp.array([1.0, -1.0] if dependent else [1.0])
+        self.spec = WorldSpec(3, 1, np.zeros(3, np.float32), np.ones(3, np.float32))
+        self.default_params = self.held_out_params = ProbeParams(signs)
+
+    def scenario_count(self, params):
+        return params.signs.shape[0]
+
+    def scenario_numbers(self, params):
+        return jnp.arange(params.signs.shape[0])
+
+    def reset_to(self, index, key, params):
+        return ProbeState(params.signs[index], jnp.zeros(()), jnp.zeros((), jnp.int32))
+
+    def observe(self, state, params):
+        return jnp.stack([state.sign, state.error, jnp.ones(())])
+
+    def transition(self, key, state, action, params):
+        miss = jnp.abs(action[0] - self.answer(state.sign))
+        error = jnp.where(miss > self.tolerance, state.error + miss, 0.0)
+        time = state.time + 1
+        unsafe = error > 1.0
+        outcome = Outcome(
+            reward=-miss, terminated=unsafe, truncated=time >= self.max_episode_steps,
+            cost=unsafe.astype(jnp.float32), success=(time >= self.max_episode_steps) & ~unsafe,
+            unsafe=unsafe, progress=time / self.max_episode_steps, speed=jnp.float32(10.0),
+        )
+        return ProbeState(state.sign, error, time), outcome
+
+    @staticmethod
+    def answer(sign):
+        return 0.6 * sign
+
+    @staticmethod
+    def scripted_expert(key, state, observation, params):
+        return jnp.atleast_1d(Probe.answer(state.sign))

@@ -1,0 +1,170 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ppl_jax.algorithms import ALGORITHMS
+from ppl_jax.config import HParams, TrainConfig, reference, validate
+from ppl_jax.evaluation import make_evaluate
+from ppl_jax.training import make_train
+from tests.probes import Probe
+
+TINY = TrainConfig(
+    total_steps=600, batch_size=32, hidden=(32,), prediction_horizon=6, decision_interval=5,
+    max_preference_horizon=6, human_capacity=600, preference_capacity=2000,
+)
+HP = HParams(learning_rate=3e-3)
+
+
+def functions(dependent=True, algorithm="ppl", **changes):
+    probe = Probe(dependent)
+    config = dataclasses.replace(TINY, **changes)
+    return probe, make_train(probe, probe.scripted_expert, ALGORITHMS[algorithm], config)
+
+
+def success(probe, fns, learner):
+    params = fns.algorithm.policy_params(learner.algorithm)
+    state = learner.algorithm.replace(params=params)
+    run = make_evaluate(probe, lambda k, s, o, p: fns.algorithm.act(state, o))
+    return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
+
+
+@pytest.mark.parametrize("algorithm", ["ppl", "bc_only"])
+@pytest.mark.parametrize("dependent", [False, True])
+def test_probe_worlds_are_solved(algorithm, dependent):
+    probe, fns = functions(dependent, algorithm)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP)
+    assert success(probe, fns, learner) == 1.0
+    for sign in probe.default_params.signs:
+        action = fns.algorithm.act(learner.algorithm, jnp.array([sign, 0.0, 1.0]))
+        assert float(action[0]) == pytest.approx(float(probe.answer(sign)), abs=probe.tolerance)
+    assert int(learner.counters.human_data) < 400  # the expert is needed less and less
+
+
+def test_the_released_settings_run_and_solve_the_probe():
+    probe = Probe()
+    config, hparams = reference()
+    config = dataclasses.replace(
+        config, total_steps=600, batch_size=32, hidden=(32,), predictor="simulator",
+    )
+    fns = make_train(probe, probe.scripted_expert, ALGORITHMS["ppl"], config)
+    hparams = hparams.replace(learning_rate=3e-3, min_return=-3.0)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
+    assert success(probe, fns, learner) == 1.0
+
+
+def test_without_an_expert_in_reach_nothing_is_learnt():
+    # a gate that never fires: no data, no update
+    probe, fns = functions()
+    algorithm = fns.algorithm._replace(decide=lambda state, trajectory, hparams: jnp.zeros((), bool))
+    fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
+    start = fns.init(jax.random.key(0), HP)
+    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
+    assert int(learner.counters.human_data) == 0
+    for a, b in zip(
+        jax.tree.leaves(start.algorithm.params), jax.tree.leaves(learner.algorithm.params),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_vmapped_batch_is_the_runs_one_by_one():
+    _, fns = functions(total_steps=100)
+    seeds = jnp.arange(4)
+    grid = HParams(
+        preference_horizon=jnp.array([1.0, 3.0, 6.0, 4.0]), beta=jnp.array([0.1, 0.3, 1.0, 0.0]),
+        prediction_noise=jnp.array([0.0, 0.1, 0.2, 0.0]),
+        expert_noise=jnp.array([0.0, 0.0, 0.1, 0.2]), learning_rate=jnp.full(4, 1e-3),
+    )
+    axes = HParams(**{
+        f.name: 0 if jnp.ndim(getattr(grid, f.name)) else None for f in dataclasses.fields(grid)
+    })
+    keys = jax.vmap(jax.random.key)(seeds)
+    together, metrics = jax.jit(jax.vmap(fns.train, in_axes=(0, axes)))(keys, grid)
+    train = jax.jit(fns.train)
+    for i in range(4):
+        one = HParams(**{
+            f.name: value[i] if jnp.ndim(value := getattr(grid, f.name)) else value
+            for f in dataclasses.fields(grid)
+        })
+        alone, alone_metrics = train(keys[i], jax.tree.map(jnp.float32, one))
+        assert int(alone.counters.human_data) == int(together.counters.human_data[i])
+        for a, b in zip(
+            jax.tree.leaves(alone.algorithm.params),
+            jax.tree.leaves(jax.tree.map(lambda x, i=i: x[i], together.algorithm.params)),
+            strict=True,
+        ):
+            np.testing.assert_allclose(a, b, atol=2e-4)
+        np.testing.assert_allclose(
+            alone_metrics["train/loss_bc"], metrics["train/loss_bc"][i], rtol=2e-2, atol=1e-4
+        )
+    assert train._cache_size() == 1  # another L, beta, noise, learning rate or seed compiles nothing
+
+
+def test_chunks_are_the_whole_run_bit_for_bit():
+    _, fns = functions(total_steps=60)
+    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    start = jax.jit(fns.init)(jax.random.key(3), HP)
+    halves = start
+    for _ in range(4):
+        halves, _ = chunk(halves, 3)
+    whole, _ = chunk(start, 12)
+    for a, b in zip(jax.tree.leaves(halves), jax.tree.leaves(whole), strict=True):
+        if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_buffers_hold_what_algorithm_1_says():
+    """Replay the run step by step in Python and compare the data sets."""
+    probe, fns = functions(total_steps=100)
+    hparams = HP.replace(preference_horizon=2)
+    learner = jax.jit(fns.init)(jax.random.key(0), hparams)
+    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    learner, _ = chunk(learner, 20)
+    human, pairs = learner.algorithm.human_buffer, learner.algorithm.preference_buffer
+    count = int(human.added)
+    assert count == int(learner.counters.human_data) > 0
+    observations, actions = (np.asarray(x)[:count] for x in human.data)
+    np.testing.assert_allclose(actions[:, 0], 0.6 * observations[:, 0], atol=1e-6)
+    held = int(pairs.added)
+    assert count <= held <= 2 * count
+    np.testing.assert_allclose(
+        np.asarray(pairs.data.preferred_action)[:held, 0],
+        0.6 * np.asarray(pairs.data.observation)[:held, 0], atol=1e-6,
+    )
+    # each taken-over step's first predicted error is the present one plus the novice's miss
+    novice = np.asarray(pairs.data.rejected_action)[:held, 0]
+    miss = np.abs(novice - np.asarray(pairs.data.preferred_action)[:held, 0])
+    error = np.asarray(pairs.data.observation)[:held, 1]
+    assert (error[miss > probe.tolerance] >= miss[miss > probe.tolerance] - 1e-5).all()
+
+
+def test_a_diverged_run_is_flagged_and_frozen():
+    _, fns = functions(total_steps=100)
+    learner = jax.jit(fns.init)(jax.random.key(0), HP)
+    broken = jax.tree.map(lambda x: x.at[...].set(jnp.nan), learner.algorithm.params)
+    learner = learner.replace(algorithm=learner.algorithm.replace(params=broken))
+    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(learner, 2)
+    assert bool(learner.diverged)
+    assert int(learner.counters.steps) == 10
+
+
+@pytest.mark.parametrize(
+    ("config", "hparams", "message"),
+    [
+        ({"total_steps": 0}, {}, "total_steps must be at least 1, got 0"),
+        ({"total_steps": 7}, {}, "total_steps must be a multiple of decision_interval"),
+        ({}, {"preference_horizon": 0}, "preference_horizon must be at least 1, got 0"),
+        ({}, {"preference_horizon": 7}, "preference_horizon must not exceed prediction_horizon"),
+        ({}, {"beta": -0.1}, "beta must not be negative"),
+        ({}, {"beta": float("nan")}, "beta must not be negative, got nan"),
+        ({}, {"prediction_noise": -1.0}, "prediction_noise must not be negative"),
+        ({"hidden": ()}, {}, "hidden must name at least one width"),
+    ],
+)
+def test_bad_settings_are_one_clear_line(config, hparams, message):
+    with pytest.raises(ValueError, match=message) as error:
+        validate(dataclasses.replace(TINY, **config), HP.replace(**hparams))
+    assert "\n" not in str(error.value)
