@@ -34,7 +34,7 @@ def preference_pairs(
     def repeat(action: jax.Array) -> jax.Array:
         return jnp.broadcast_to(action, (count, *action.shape))
 
-    observation, rejected = predicted.observation, predicted.observation[:, :0]
+    observation, rejected = predicted.observation, None
     if pair_states == "shifted":
         rejected = predicted.observation
         observation = jnp.concatenate([step.observation[None], rejected[:-1]])

@@ -108,13 +108,13 @@ class PreferenceBatch:
         observation: [B, O] (predicted) state.
         preferred_action, rejected_action: [B, A]: the expert's and the novice's.
         rejected_observation: [B, O] state of the rejected action where it is another one (the
-            released code's pairs), else [B, 0].
+            released code's pairs), else None.
     """
 
     observation: jax.Array
     preferred_action: jax.Array
     rejected_action: jax.Array
-    rejected_observation: jax.Array
+    rejected_observation: jax.Array | None
 
 
 class WorldSpec(NamedTuple):

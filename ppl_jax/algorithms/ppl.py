@@ -55,9 +55,7 @@ def _make(
     def init(key: jax.Array) -> PPLState:
         params = policy.init(key)
         observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
-        pair = PreferenceBatch(
-            observation, action, action, observation if shifted else observation[:0]
-        )
+        pair = PreferenceBatch(observation, action, action, observation if shifted else None)
         return PPLState(
             params=params,
             opt_state=init_adam(params),
