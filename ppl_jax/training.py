@@ -55,7 +55,7 @@ class Learner:
         key: Random key.
         hparams: The run's hyper-parameters.
         counters: `Counters`.
-        diverged: A loss was not finite: the method's state stays as it was before.
+        diverged: A loss was not finite: what was learned stays as it was before.
     """
 
     algorithm: PyTree
@@ -209,10 +209,10 @@ def make_train(
         diverged = learner.diverged | ~finite
         kept = jax.tree.map(
             lambda new, old: jnp.where(diverged, old, new),
-            algorithm.policy_params(updated),
-            algorithm.policy_params(stored),
+            updated.learned,
+            stored.learned,
         )
-        updated = updated.replace(params=kept)
+        updated = updated.replace(learned=kept)
         done = outcome.terminated | outcome.truncated
         restarted = jax.lax.cond(
             done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset

@@ -26,7 +26,7 @@ def functions(dependent=True, algorithm="ppl", **changes):
 
 def success(probe, fns, learner):
     params = fns.algorithm.policy_params(learner.algorithm)
-    state = learner.algorithm.replace(params=params)
+    state = learner.algorithm.replace(learned=learner.algorithm.learned.replace(params=params))
     run = make_evaluate(probe, lambda k, s, o, p: fns.algorithm.act(state, o))
     return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
 
@@ -64,7 +64,7 @@ def test_without_an_expert_in_reach_nothing_is_learnt():
     learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
     assert int(learner.counters.human_data) == 0
     for a, b in zip(
-        jax.tree.leaves(start.algorithm.params), jax.tree.leaves(learner.algorithm.params),
+        jax.tree.leaves(start.algorithm.learned), jax.tree.leaves(learner.algorithm.learned),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
@@ -92,8 +92,8 @@ def test_a_vmapped_batch_is_the_runs_one_by_one():
         alone, alone_metrics = train(keys[i], jax.tree.map(jnp.float32, one))
         assert int(alone.counters.human_data) == int(together.counters.human_data[i])
         for a, b in zip(
-            jax.tree.leaves(alone.algorithm.params),
-            jax.tree.leaves(jax.tree.map(lambda x, i=i: x[i], together.algorithm.params)),
+            jax.tree.leaves(alone.algorithm.learned),
+            jax.tree.leaves(jax.tree.map(lambda x, i=i: x[i], together.algorithm.learned)),
             strict=True,
         ):
             np.testing.assert_allclose(a, b, atol=2e-4)
@@ -144,8 +144,9 @@ def test_buffers_hold_what_algorithm_1_says():
 def test_a_diverged_run_is_flagged_and_frozen():
     _, fns = functions(total_steps=100)
     learner = jax.jit(fns.init)(jax.random.key(0), HP)
-    broken = jax.tree.map(lambda x: x.at[...].set(jnp.nan), learner.algorithm.params)
-    learner = learner.replace(algorithm=learner.algorithm.replace(params=broken))
+    broken = jax.tree.map(lambda x: x.at[...].set(jnp.nan), learner.algorithm.learned.params)
+    learned = learner.algorithm.learned.replace(params=broken)
+    learner = learner.replace(algorithm=learner.algorithm.replace(learned=learned))
     learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(learner, 2)
     assert bool(learner.diverged)
     assert int(learner.counters.steps) == 10

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
@@ -21,7 +22,8 @@ class Algorithm(NamedTuple):
 
     Attributes:
         name: As in results.
-        init: `init(key) -> state`, a pytree of parameters, optimiser and buffers.
+        init: `init(key) -> state`, a struct with buffers and a field `learned` that holds all
+            that updates change.
         act: `act(state, observation [O]) -> action [A]`, deterministic.
         decide: `decide(state, trajectory, hparams) -> bool`, whether the expert takes over for
             the next block of steps.
@@ -45,22 +47,44 @@ MakeAlgorithm = Callable[[WorldSpec, TrainConfig], Algorithm]
 """`make(spec, config) -> Algorithm`."""
 
 _ADAM = optax.scale_by_adam()
+AVERAGING = 0.999  # decay of the average of the parameters, per update
 
 
-def init_adam(params: PyTree) -> PyTree:
-    """State of Adam."""
-    return _ADAM.init(params)
+@flax.struct.dataclass
+class Learned:
+    """Parameters with their optimiser.
+
+    Attributes:
+        params: What acts while training.
+        opt_state: Of Adam.
+        average: Moving average of `params` over the last thousand or so updates: what is
+            evaluated, saved and exported. One update per step on changing data leaves the last
+            parameters noisy.
+    """
+
+    params: PyTree
+    opt_state: PyTree
+    average: PyTree
+
+
+def init_learned(params: PyTree) -> Learned:
+    """Before the first update."""
+    return Learned(params, _ADAM.init(params), params)
 
 
 def adam_step(
-    params: PyTree, opt_state: PyTree, grads: PyTree, learning_rate: jax.Array | float,
-    do: jax.Array,
-) -> tuple[PyTree, PyTree]:
+    learned: Learned, grads: PyTree, learning_rate: jax.Array | float, do: jax.Array
+) -> Learned:
     """One step of Adam with a traced learning rate where `do`, else nothing."""
-    updates, new_state = _ADAM.update(grads, opt_state, params)
 
-    def select(new: PyTree, old: PyTree) -> PyTree:
-        return jax.tree.map(lambda n, o: jnp.where(do, n, o), new, old)
+    def step(learned: Learned) -> Learned:
+        updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
+        params = jax.tree.map(lambda p, u: p - learning_rate * u, learned.params, updates)
+        count = opt_state.count.astype(jnp.float32)
+        decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
+        average = jax.tree.map(
+            lambda old, new: decay * old + (1 - decay) * new, learned.average, params
+        )
+        return Learned(params, opt_state, average)
 
-    stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
-    return select(stepped, params), select(new_state, opt_state)
+    return jax.lax.cond(do, step, lambda learned: learned, learned)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, adam_step, init_adam
+from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.intervention import RULES
@@ -21,16 +21,15 @@ from ppl_jax.types import Interaction, PreferenceBatch, Trajectory, WorldSpec
 
 @flax.struct.dataclass
 class PPLState:
-    """Parameters, optimiser and the two data sets.
+    """What is learnt and the two data sets.
 
     Attributes:
-        params, opt_state: Of the policy.
+        learned: Parameters of the policy, its optimiser and its average.
         human_buffer: D_h of (observation [O], expert action [A]).
         preference_buffer: D_pref of `PreferenceBatch`.
     """
 
-    params: Any
-    opt_state: Any
+    learned: Learned
     human_buffer: RingBuffer
     preference_buffer: RingBuffer
 
@@ -53,12 +52,10 @@ def _make(
     shifted = config.pair_states == "shifted"
 
     def init(key: jax.Array) -> PPLState:
-        params = policy.init(key)
         observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
         pair = PreferenceBatch(observation, action, action, observation if shifted else None)
         return PPLState(
-            params=params,
-            opt_state=init_adam(params),
+            learned=init_learned(policy.init(key)),
             human_buffer=buffers.init_buffer(
                 (observation, action), min(config.human_capacity, config.total_steps)
             ),
@@ -68,7 +65,7 @@ def _make(
         )
 
     def act(state: PPLState, observation: jax.Array) -> jax.Array:
-        return policy.apply(state.params, observation)
+        return policy.apply(state.learned.params, observation)
 
     def decide(state: PPLState, trajectory: Trajectory, hparams: HParams) -> jax.Array:
         return rule(trajectory, hparams)
@@ -114,14 +111,12 @@ def _make(
         has_data = buffers.size(state.human_buffer) > 0
         has_pairs = buffers.size(state.preference_buffer) > 0
         grads, metrics = jax.grad(loss, has_aux=True)(
-            state.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
+            state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
         )
-        params, opt_state = adam_step(
-            state.params, state.opt_state, grads, hparams.learning_rate, has_data
-        )
-        return state.replace(params=params, opt_state=opt_state), metrics
+        learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+        return state.replace(learned=learned), metrics
 
     def policy_params(state: PPLState) -> Any:
-        return state.params
+        return state.learned.average
 
     return Algorithm(name, init, act, decide, store, update, policy_params, with_preferences)
