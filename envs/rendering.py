@@ -99,9 +99,11 @@ class Scene:
             np.asarray, _coordinates(lanes, middle[:, None].astype(np.float32))
         )
         covered = (
-            (lanes.width > 0) & ~same_road
+            (lanes.width > 0)
+            & ~same_road
             & (np.abs(lateral) < lanes.width / 2 - 0.2)
-            & (long > 0.2) & (long < lanes.length - 0.2)
+            & (long > 0.2)
+            & (long < lanes.length - 0.2)
         ).any(-1)
         for k in np.flatnonzero(~covered):
             if not dashed or k % 3 == 0:

@@ -24,8 +24,8 @@ class Train:
     """Method: ppl, or bc_only (PPL without its preference loss)."""
     seed: int = 0
     """Random seed."""
-    preset: Literal["paper", "reference"] = "paper"
-    """Settings to start from: the paper's, or the released code's."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from: ours, the paper's to the letter, or the released code's."""
     total_steps: int | None = None
     """Environment steps."""
     preference_horizon: int | None = None
@@ -169,10 +169,15 @@ def run_settings(command: Train):
         wider = max(final.max_preference_horizon, horizon)
         final = dataclasses.replace(final, max_preference_horizon=wider)
     return RunSettings(
-        env=command.env, algorithm=command.algorithm, seed=command.seed,
-        config=final, hparams=hparams.replace(**traced),
-        expert=command.expert, scenarios=command.scenarios,
-        held_out_scenarios=command.held_out_scenarios, evaluate_every=command.evaluate_every,
+        env=command.env,
+        algorithm=command.algorithm,
+        seed=command.seed,
+        config=final,
+        hparams=hparams.replace(**traced),
+        expert=command.expert,
+        scenarios=command.scenarios,
+        held_out_scenarios=command.held_out_scenarios,
+        evaluate_every=command.evaluate_every,
     )
 
 
@@ -257,16 +262,19 @@ def _doctor(command: Doctor) -> None:
 
 
 _ACTIONS = {
-    Train: _train, Evaluate: _evaluate, Compare: _compare, Export: _export, Render: _render,
-    Bench: _bench, Doctor: _doctor,
+    Train: _train,
+    Evaluate: _evaluate,
+    Compare: _compare,
+    Export: _export,
+    Render: _render,
+    Bench: _bench,
+    Doctor: _doctor,
 }
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
-    command = tyro.cli(
-        Command, prog="ppl", args=argv, description=__doc__
-    )
+    command = tyro.cli(Command, prog="ppl", args=argv, description=__doc__)
     try:
         _ACTIONS[type(command)](command)
     except UserError as error:

@@ -59,8 +59,17 @@ def compare(command: Compare) -> None:
 
 def _start(command: Compare, job: tuple[str, int], run: Path) -> subprocess.Popen:
     words = [
-        sys.executable, "-m", "experiments.cli", "train", command.env,
-        "--algorithm", job[0], "--seed", str(job[1]), "--out", str(run),
+        sys.executable,
+        "-m",
+        "experiments.cli",
+        "train",
+        command.env,
+        "--algorithm",
+        job[0],
+        "--seed",
+        str(job[1]),
+        "--out",
+        str(run),
     ]
     for name in ("total_steps", "scenarios", "held_out_scenarios"):
         value = getattr(command, name)

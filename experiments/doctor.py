@@ -19,8 +19,10 @@ def doctor() -> None:
     import jax
 
     found = device()
-    print(f"  JAX computes on {found['count']} {found['platform']} device ({found['kind']}), "
-          f"with {found['cores']} processor cores.")
+    print(
+        f"  JAX computes on {found['count']} {found['platform']} device ({found['kind']}), "
+        f"with {found['cores']} processor cores."
+    )
     if found["platform"] == "cpu":
         print("  That is enough for every default here. For an NVIDIA GPU install jax[cuda12].")
     began = time.perf_counter()
@@ -31,11 +33,15 @@ def doctor() -> None:
     if os.access(folder, os.W_OK):
         files = list(folder.glob("*"))
         size = sum(file.stat().st_size for file in files) / 1e6
-        print(f"  {folder}: {len(files)} programs, {size:.0f} MB. The first run of a program "
-              "compiles for some seconds; later ones load it from here.")
+        print(
+            f"  {folder}: {len(files)} programs, {size:.0f} MB. The first run of a program "
+            "compiles for some seconds; later ones load it from here."
+        )
     else:
-        print(f"  {folder} cannot be written: every run will compile again. Set PPL_JAX_CACHE to "
-              "a folder that can.")
+        print(
+            f"  {folder} cannot be written: every run will compile again. Set PPL_JAX_CACHE to "
+            "a folder that can."
+        )
     print("\nExtras")
     for module, extra, what in (
         ("PIL", "render", "pictures and GIFs"),

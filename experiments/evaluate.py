@@ -52,9 +52,7 @@ def evaluate_policy(env: Env, policy: SavedPolicy, step: int) -> list[Evaluation
         (list(policy.weights), policy.obs_mean, policy.obs_scale),
     )
     params = env.held_out_params
-    episodes = _episodes(
-        env, arrays, policy.activation, policy.output, params, jax.random.key(0)
-    )
+    episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
     return rows_of(episodes, env.scenario_numbers(params), step)
 
 
@@ -63,8 +61,13 @@ def rows_of(episodes: Episodes, numbers: Any, step: int) -> list[EvaluationRow]:
     columns = [np.asarray(column) for column in episodes]
     return [
         EvaluationRow(
-            step, int(numbers[i]), int(columns[0][i]), round(float(columns[1][i]), 4),
-            round(float(columns[3][i]), 5), round(float(columns[2][i]), 4), int(columns[4][i]),
+            step,
+            int(numbers[i]),
+            int(columns[0][i]),
+            round(float(columns[1][i]), 4),
+            round(float(columns[3][i]), 5),
+            round(float(columns[2][i]), 4),
+            int(columns[4][i]),
         )
         for i in range(len(columns[0]))
     ]
@@ -87,9 +90,13 @@ def read_evaluation(run: Path) -> list[EvaluationRow]:
     with open(run / EVALUATION, newline="") as file:
         return [
             EvaluationRow(
-                int(row["step"]), int(row["scenario"]), int(row["success"]),
-                float(row["episodic_return"]), float(row["progress"]),
-                float(row["episodic_cost"]), int(row["length"]),
+                int(row["step"]),
+                int(row["scenario"]),
+                int(row["success"]),
+                float(row["episodic_return"]),
+                float(row["progress"]),
+                float(row["episodic_cost"]),
+                int(row["length"]),
             )
             for row in csv.DictReader(file)
         ]

@@ -25,7 +25,10 @@ def save_policy(path: str | Path, policy: SavedPolicy, meta: dict[str, Any]) -> 
     part = Path(f"{path}.part")
     with open(part, "wb") as file:
         np.savez(
-            file, **arrays, activation=np.array(policy.activation), output=np.array(policy.output),
+            file,
+            **arrays,
+            activation=np.array(policy.activation),
+            output=np.array(policy.output),
             obs_mean=np.asarray(policy.obs_mean, np.float32),
             obs_scale=np.asarray(policy.obs_scale, np.float32),
             meta=np.array(json.dumps(meta)),
@@ -57,9 +60,12 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
         )
     mean = files.get("obs_mean", np.zeros(observation_size, np.float32))
     scale = files.get("obs_scale", np.ones(observation_size, np.float32))
-    for name, value in [*((f"w{i}", w) for i, (w, _) in enumerate(weights)),
-                        *((f"b{i}", b) for i, (_, b) in enumerate(weights)),
-                        ("obs_mean", mean), ("obs_scale", scale)]:
+    for name, value in [
+        *((f"w{i}", w) for i, (w, _) in enumerate(weights)),
+        *((f"b{i}", b) for i, (_, b) in enumerate(weights)),
+        ("obs_mean", mean),
+        ("obs_scale", scale),
+    ]:
         if not np.isfinite(value).all():
             raise ValueError(f"policy file {str(path)!r}: {name} holds a NaN or infinite number")
     takes, gives = weights[0][0].shape[0], weights[-1][0].shape[1]

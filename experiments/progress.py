@@ -22,8 +22,12 @@ class Progress:
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
             self.bar = Progress(
-                TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f}%"),
-                TimeRemainingColumn(), TextColumn("{task.fields[note]}"), transient=False,
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.percentage:.0f}%"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[note]}"),
+                transient=False,
             )
 
     def __enter__(self) -> Progress:
@@ -54,5 +58,6 @@ class Progress:
         left = spent / max(done - self.first, 1) * (self.total - done)
         print(
             f"{self.what} {done}/{self.total}  {note}  [{spent:.0f}s, {left:.0f}s left]",
-            file=sys.stderr, flush=True,
+            file=sys.stderr,
+            flush=True,
         )

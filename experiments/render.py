@@ -14,7 +14,7 @@ from envs.rendering import Paths, Scene, draw, save_frames
 from experiments.evaluate import make_world, policy_path, run_options
 from experiments.policy_file import load_policy
 from experiments.runtime import UserError
-from ppl_jax.config import paper
+from ppl_jax.config import default
 from ppl_jax.experts import neural_expert
 from ppl_jax.intervention import unsafe_or_slow
 from ppl_jax.predictor import predict
@@ -64,7 +64,7 @@ def episode(env: Driving, act, number: int, steps: int) -> list[np.ndarray]:
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
-    config, hparams = paper()
+    config, hparams = default()
     horizon, key = config.prediction_horizon, jax.random.key(0)
 
     def positions(state: DrivingState, policy, held: bool) -> jax.Array:

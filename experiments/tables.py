@@ -19,7 +19,9 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     table = [list(header), *[list(row) for row in rows]]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     for i, row in enumerate(table):
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        print(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        )
         if i == 0:
             print("  ".join("-" * width for width in widths))
 
@@ -44,18 +46,26 @@ def print_run(run: Path) -> None:
     lines = []
     for step in sorted({row.step for row in rows}):
         scores = summarise_episodes([row for row in rows if row.step == step])
-        lines.append([
-            str(step), str(human[step]), f"{scores['success_rate']:.2f}",
-            f"{scores['route_completion']:.2f}", f"{scores['episodic_return']:.0f}",
-            f"{scores['episodic_cost']:.2f}", f"{scores['episode_length']:.0f}",
-        ])
-    print(f"\n{config['algorithm']} on {config['env']}, seed {config['seed']}: "
-          f"{summary['episodes']} held-out scenarios, each played once, without the expert")
-    print_table(
-        ["step", "human data", "success", "route", "return", "cost", "length"], lines
+        lines.append(
+            [
+                str(step),
+                str(human[step]),
+                f"{scores['success_rate']:.2f}",
+                f"{scores['route_completion']:.2f}",
+                f"{scores['episodic_return']:.0f}",
+                f"{scores['episodic_cost']:.2f}",
+                f"{scores['episode_length']:.0f}",
+            ]
+        )
+    print(
+        f"\n{config['algorithm']} on {config['env']}, seed {config['seed']}: "
+        f"{summary['episodes']} held-out scenarios, each played once, without the expert"
     )
-    print(f"\n{summary['wall_s']:.0f} s in all, {summary['compile_s']:.0f} s of it compiling; "
-          f"the run folder is {run}")
+    print_table(["step", "human data", "success", "route", "return", "cost", "length"], lines)
+    print(
+        f"\n{summary['wall_s']:.0f} s in all, {summary['compile_s']:.0f} s of it compiling; "
+        f"the run folder is {run}"
+    )
 
 
 def print_evaluation(name: str, rows: list[EvaluationRow]) -> None:
@@ -68,11 +78,15 @@ def print_evaluation(name: str, rows: list[EvaluationRow]) -> None:
 
     print_table(
         ["success", "route", "return", "cost", "length"],
-        [[
-            cell([row.success for row in rows], 2), cell([row.progress for row in rows], 2),
-            cell([row.episodic_return for row in rows], 0),
-            cell([row.episodic_cost for row in rows], 2), cell([row.length for row in rows], 0),
-        ]],
+        [
+            [
+                cell([row.success for row in rows], 2),
+                cell([row.progress for row in rows], 2),
+                cell([row.episodic_return for row in rows], 0),
+                cell([row.episodic_cost for row in rows], 2),
+                cell([row.length for row in rows], 0),
+            ]
+        ],
     )
 
 
@@ -100,16 +114,23 @@ def print_comparison(path: Path) -> None:
     lines = []
     for algorithm in algorithms:
         human = scores(algorithm, "human_data_usage")[:, 0]
-        lines.append([
-            algorithm, str(len(human)), f"{human.mean():.0f} ({human.mean() / last:.2f})",
-            str(last),
-            *[
-                show(mean_interval(scores(algorithm, column), rng), digits)
-                for column, digits in (
-                    ("success", 2), ("progress", 2), ("episodic_return", 0), ("episodic_cost", 2),
-                )
-            ],
-        ])
+        lines.append(
+            [
+                algorithm,
+                str(len(human)),
+                f"{human.mean():.0f} ({human.mean() / last:.2f})",
+                str(last),
+                *[
+                    show(mean_interval(scores(algorithm, column), rng), digits)
+                    for column, digits in (
+                        ("success", 2),
+                        ("progress", 2),
+                        ("episodic_return", 0),
+                        ("episodic_cost", 2),
+                    )
+                ],
+            ]
+        )
     print_table(
         ["method", "seeds", "human data", "steps", "success", "route", "return", "cost"], lines
     )

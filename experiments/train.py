@@ -25,7 +25,7 @@ from experiments.progress import Progress
 from experiments.runtime import UserError, device, revision, versions
 from ppl_jax import checkpoint
 from ppl_jax.algorithms import ALGORITHMS
-from ppl_jax.config import PRESETS, HParams, TrainConfig, validate
+from ppl_jax.config import HParams, TrainConfig, validate
 from ppl_jax.experts import SavedPolicy, neural_expert
 from ppl_jax.networks import layers
 from ppl_jax.runlog import POLICY, SUMMARY, RunFolder
@@ -196,9 +196,14 @@ def _open(folder: RunFolder, settings: RunSettings, resume: bool) -> None:
                 )
         return
     try:
-        folder.create(content | {
-            "versions": versions(), "device": device(), "revision": revision(),
-        })
+        folder.create(
+            content
+            | {
+                "versions": versions(),
+                "device": device(),
+                "revision": revision(),
+            }
+        )
     except ValueError as error:
         raise UserError(str(error)) from error
 
@@ -258,9 +263,7 @@ class _Runner:
         rows = evaluate_policy(self.env, saved_policy(self.env, params), step)
         scores = summarise_episodes(rows)
         human = int(learner.counters.human_data)
-        self.folder.append_evaluation(
-            [row._asdict() | {"human_data_usage": human} for row in rows]
-        )
+        self.folder.append_evaluation([row._asdict() | {"human_data_usage": human} for row in rows])
         values = {name: float(value) for name, value in metrics.items()}
         self.folder.append_metrics(
             {"step": step}
@@ -310,4 +313,3 @@ class _Runner:
         }
         self.folder.write_json(SUMMARY, summary)
         return summary
-

@@ -36,7 +36,7 @@ def _orbax() -> Any:
 def _checksum(tree: PyTree) -> int:
     total = 0
     for leaf in jax.tree.leaves(tree):
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.random.key_data(leaf)
         total = zlib.crc32(np.ascontiguousarray(leaf).view(np.uint8).ravel().data, total)
     return total
@@ -73,9 +73,7 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
         shutil.rmtree(folder / f"{_PREFIX}{old}", ignore_errors=True)
 
 
-def restore(
-    folder: Path, like: PyTree, warn: Callable[[str], None]
-) -> tuple[int, PyTree] | None:
+def restore(folder: Path, like: PyTree, warn: Callable[[str], None]) -> tuple[int, PyTree] | None:
     """The newest whole checkpoint as (step, tree), or None if there is none.
 
     Args:

@@ -1,9 +1,9 @@
 """The likelihood that the losses and `beta` refer to.
 
-A policy outputs mu(s) in [-1, 1]^A; the paper does not say which density around it its log pi means,
-and `beta` means nothing without one. Two are offered; constants that cancel are left out.
+A policy outputs mu(s) in [-1, 1]^A; the paper does not say which density around it its log pi
+means, and `beta` means nothing without one. Two are offered; constants that cancel are left out.
 
-`laplace` (default): log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.1. A smoothed
+`laplace`: log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.1. A smoothed
 multivariate Laplace density: quadratic within w of mu (there it is a Gaussian of standard deviation
 0.1), linear beyond. What matters is the linear tail. Along the line from a- through a+ it makes
 
@@ -11,8 +11,8 @@ multivariate Laplace density: quadratic within w of mu (there it is a Gaussian o
 
 stop growing once mu has reached a+, so the paper's preference loss has its optimum there.
 
-`gaussian`: log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate. With it that
-difference is linear in mu: the loss has no optimum inside the action box and pushes mu past a+ to
+`gaussian` (default): log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate.
+With it that difference is linear in mu: the loss has no optimum inside the action box and pushes mu past a+ to
 a corner, unless the rejected term is scaled down (the released code's 0.5).
 
 Both are finite with finite gradients everywhere on the action box, its corners included, where the
@@ -28,8 +28,8 @@ LAPLACE_SCALE = 0.1  # b
 LAPLACE_CORE = 0.1  # w
 
 
-def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "laplace") -> jax.Array:
-    """log pi(action | mean) up to a constant, [..., A], [..., A] -> [...].
+def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -> jax.Array:
+    """Log pi(action | mean) up to a constant, [..., A], [..., A] -> [...].
 
     Args:
         mean, action: In [-1, 1].

@@ -46,9 +46,7 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
             jnp.arange(count), jax.random.split(key_reset, count), params
         )
         zero = jnp.zeros(count)
-        start = Episodes(
-            jnp.zeros(count, bool), zero, zero, zero, jnp.zeros(count, jnp.int32)
-        )
+        start = Episodes(jnp.zeros(count, bool), zero, zero, zero, jnp.zeros(count, jnp.int32))
 
         def one(key: jax.Array, state: Any) -> Any:
             key_act, key_step = jax.random.split(key)

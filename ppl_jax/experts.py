@@ -41,9 +41,7 @@ def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
 
 def neural_expert(policy: SavedPolicy) -> Expert:
     """An expert that acts as a saved policy does."""
-    arrays = jax.tree.map(
-        jnp.asarray, (list(policy.weights), policy.obs_mean, policy.obs_scale)
-    )
+    arrays = jax.tree.map(jnp.asarray, (list(policy.weights), policy.obs_mean, policy.obs_scale))
     weights, mean, scale = arrays
     policy = policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
 

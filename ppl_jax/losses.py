@@ -20,7 +20,7 @@ Metrics = dict[str, jax.Array]
 def bc_loss(
     mean: jax.Array,
     expert_action: jax.Array,
-    likelihood: str = "laplace",
+    likelihood: str = "gaussian",
     reduction: str = "sum",
 ) -> tuple[jax.Array, Metrics]:
     """Behaviour cloning: -E[log pi(a_h|s)].
@@ -45,7 +45,7 @@ def cpo_loss(
     rejected_action: jax.Array,
     beta: jax.Array | float,
     bias: jax.Array | float = 1.0,
-    likelihood: str = "laplace",
+    likelihood: str = "gaussian",
 ) -> tuple[jax.Array, Metrics]:
     """Contrastive preference loss: -E[log sigmoid(beta (log pi(a+|s) - bias log pi(a-|s)))].
 

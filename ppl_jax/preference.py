@@ -1,8 +1,8 @@
 """Preference pairs over the first L predicted states.
 
-For an intervention at s_t with novice action a_n and expert action a_h, the predictor holds a_n and
-reaches s~_1 .. s~_H; each of the first L gives the pair (s~_i, a+ = a_h, a- = a_n) (paper, Algorithm
-1). L is traced: pairs past it are masked, so sweeping it compiles nothing.
+For an intervention at s_t with novice action a_n and expert action a_h, the predictor holds a_n
+and reaches s~_1 .. s~_H; each of the first L gives the pair (s~_i, a+ = a_h, a- = a_n) (Algorithm 1
+of the paper). L is traced: pairs past it are masked, so sweeping it compiles nothing.
 """
 
 from __future__ import annotations

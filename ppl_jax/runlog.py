@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import Any
 
 CONFIG, METRICS, EVALUATION, SUMMARY, CHECKPOINTS, POLICY = (
-    "config.json", "metrics.jsonl", "evaluation.csv", "summary.json", "checkpoints", "policy.npz",
+    "config.json",
+    "metrics.jsonl",
+    "evaluation.csv",
+    "summary.json",
+    "checkpoints",
+    "policy.npz",
 )
 
 

@@ -20,9 +20,7 @@ class Interval(NamedTuple):
     high: float
 
 
-def _resampled_means(
-    scores: np.ndarray, rng: np.random.Generator, replicates: int
-) -> np.ndarray:
+def _resampled_means(scores: np.ndarray, rng: np.random.Generator, replicates: int) -> np.ndarray:
     seeds, scenarios = scores.shape
     out = np.empty(replicates)
     for i in range(replicates):
@@ -43,7 +41,10 @@ def mean_interval(
 
 
 def paired_difference(
-    ours: np.ndarray, theirs: np.ndarray, rng: np.random.Generator, level: float = 0.95,
+    ours: np.ndarray,
+    theirs: np.ndarray,
+    rng: np.random.Generator,
+    level: float = 0.95,
     replicates: int = 2000,
 ) -> Interval:
     """Mean of `ours - theirs`, [seeds, scenarios] each, seeds and scenarios paired."""

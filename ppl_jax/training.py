@@ -7,6 +7,7 @@ by one update. Everything is one scan over blocks of K steps; the host acts betw
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -139,22 +140,31 @@ def make_train(
         action = propose(learner, key_propose, observation)
         asked_again = config.gate_rollout == "closed_loop"
         trajectory = predict(
-            env, transition, key_predict, learner.env_state, action, params,
+            env,
+            transition,
+            key_predict,
+            learner.env_state,
+            action,
+            params,
             config.prediction_horizon,
             act=functools.partial(algorithm.act, learner.algorithm) if asked_again else None,
         )
         return algorithm.decide(learner.algorithm, trajectory, learner.hparams)
 
-    def look_ahead(
-        learner: Learner, key: jax.Array, action: jax.Array
-    ) -> Trajectory:
+    def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
         """The first predicted states, for the pairs; skipped while the novice is in control."""
         horizon = config.max_preference_horizon
         key_predict, key_noise = jax.random.split(key)
 
         def ahead(_: Any) -> Trajectory:
             return predict(
-                env, transition, key_predict, learner.env_state, action, params, horizon,
+                env,
+                transition,
+                key_predict,
+                learner.env_state,
+                action,
+                params,
+                horizon,
                 observe=True,
             )
 
@@ -163,10 +173,11 @@ def make_train(
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
         trajectory = jax.lax.cond(learner.takeover, ahead, nothing, None)
-        return trajectory.replace(
+        return dataclasses.replace(
+            trajectory,
             observation=add_noise(
                 key_noise, trajectory.observation, learner.hparams.prediction_noise
-            )
+            ),
         )
 
     def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
@@ -212,7 +223,7 @@ def make_train(
             updated.learned,
             stored.learned,
         )
-        updated = updated.replace(learned=kept)
+        updated = dataclasses.replace(updated, learned=kept)
         done = outcome.terminated | outcome.truncated
         restarted = jax.lax.cond(
             done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset
@@ -227,7 +238,8 @@ def make_train(
             cost=counters.cost + outcome.cost,
         )
         # a takeover ends with its episode; the next decision waits for the grid
-        return learner.replace(
+        return dataclasses.replace(
+            learner,
             algorithm=updated,
             env_state=restarted,
             takeover=takeover & ~done,
@@ -240,7 +252,7 @@ def make_train(
         key, key_decide = jax.random.split(learner.key)
         was_expert = learner.takeover
         takeover = decide(learner, key_decide)
-        learner = learner.replace(takeover=takeover, key=key)
+        learner = dataclasses.replace(learner, takeover=takeover, key=key)
         first = jnp.arange(interval) == 0
         learner, metrics = jax.lax.scan(step, learner, first & ~was_expert)
         return learner, jax.tree.map(jnp.mean, metrics)

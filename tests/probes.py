@@ -54,9 +54,14 @@ class Probe(Environment):
         time = state.time + 1
         unsafe = error > 1.0
         outcome = Outcome(
-            reward=-miss, terminated=unsafe, truncated=time >= self.max_episode_steps,
-            cost=unsafe.astype(jnp.float32), success=(time >= self.max_episode_steps) & ~unsafe,
-            unsafe=unsafe, progress=time / self.max_episode_steps, speed=jnp.float32(10.0),
+            reward=-miss,
+            terminated=unsafe,
+            truncated=time >= self.max_episode_steps,
+            cost=unsafe.astype(jnp.float32),
+            success=(time >= self.max_episode_steps) & ~unsafe,
+            unsafe=unsafe,
+            progress=time / self.max_episode_steps,
+            speed=jnp.float32(10.0),
         )
         return ProbeState(state.sign, error, time), outcome
 

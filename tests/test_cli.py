@@ -19,8 +19,14 @@ TINY = ["--total-steps", "60", "--batch-size", "16", "--evaluate-every", "20"]
 
 
 def command(*words):
-    return [sys.executable, "-W", "error::DeprecationWarning", "-m", "experiments.cli",
-            *map(str, words)]
+    return [
+        sys.executable,
+        "-W",
+        "error::DeprecationWarning",
+        "-m",
+        "experiments.cli",
+        *map(str, words),
+    ]
 
 
 def ppl(*words, code=0):
@@ -44,9 +50,20 @@ def test_a_run_prints_its_table_and_leaves_a_run_folder(run):
     assert "train driving 60/60" in done.stderr
     summary = json.loads((out / "summary.json").read_text())
     for name in (
-        "env", "algorithm", "seed", "total_steps", "human_data_usage", "intervention_rate",
-        "success_rate", "episodic_return", "route_completion", "episodic_cost", "episodes",
-        "wall_s", "compile_s", "steps_per_s",
+        "env",
+        "algorithm",
+        "seed",
+        "total_steps",
+        "human_data_usage",
+        "intervention_rate",
+        "success_rate",
+        "episodic_return",
+        "route_completion",
+        "episodic_cost",
+        "episodes",
+        "wall_s",
+        "compile_s",
+        "steps_per_s",
     ):
         assert name in summary
     assert summary["episodes"] == 50
@@ -120,8 +137,10 @@ def test_a_killed_run_resumes_bit_for_bit(run, tmp_path, moment):
         "between": lambda: (folder / "step_20" / "checksum.json").exists(),
     }[moment]
     process = subprocess.Popen(
-        command("train", "driving", *TINY, "--out", out), cwd=ROOT,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        command("train", "driving", *TINY, "--out", out),
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     deadline = time.time() + 300
     while not seen() and process.poll() is None and time.time() < deadline:

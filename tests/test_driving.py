@@ -53,16 +53,28 @@ def test_lidar_against_ray_by_ray_intersection():
     scan = jax.jit(lidar.scan)
     for _ in range(5):
         pose = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)])
-        boxes = np.concatenate([rng.uniform(8, 40, (4, 2)) * rng.choice([-1, 1], (4, 2)),
-                                rng.uniform(-3, 3, (4, 1))], 1)
+        boxes = np.concatenate(
+            [rng.uniform(8, 40, (4, 2)) * rng.choice([-1, 1], (4, 2)), rng.uniform(-3, 3, (4, 1))],
+            1,
+        )
         halves = rng.uniform(0.5, 3, (4, 2))
-        circles = np.concatenate([rng.uniform(6, 30, (3, 2)) * rng.choice([-1, 1], (3, 2)),
-                                  rng.uniform(0.1, 0.6, (3, 1))], 1)
+        circles = np.concatenate(
+            [
+                rng.uniform(6, 30, (3, 2)) * rng.choice([-1, 1], (3, 2)),
+                rng.uniform(0.1, 0.6, (3, 1)),
+            ],
+            1,
+        )
         ours = np.asarray(scan(*map(jnp.float32, (pose, boxes, halves, circles))))
-        theirs = np.array([
-            min(ray_hits(pose[:2], pose[2] + np.radians(1.5 * i), boxes, halves, circles) / 50, 1)
-            for i in range(240)
-        ])
+        theirs = np.array(
+            [
+                min(
+                    ray_hits(pose[:2], pose[2] + np.radians(1.5 * i), boxes, halves, circles) / 50,
+                    1,
+                )
+                for i in range(240)
+            ]
+        )
         # a ray that grazes a corner may go either way in single precision
         assert (np.abs(ours - theirs) > 1e-3).sum() <= 1
 
@@ -94,9 +106,7 @@ def test_lane_coordinates_invert_positions_on_every_lane():
 
 def test_speed_limit_engine_brake_and_drag():
     """Known answers of the simulator's car (784.16 N, 114.16 N s per wheel, 1100 kg)."""
-    drive = jax.jit(
-        lambda ego, action: vehicle.drive(ego, action, 784.16, 114.16, 0.9)
-    )
+    drive = jax.jit(lambda ego, action: vehicle.drive(ego, action, 784.16, 114.16, 0.9))
 
     def speeds(v0, pedal, steps):
         ego = vehicle.place(jnp.zeros(3), jnp.array([v0, 0.0]), jnp.zeros(()), jnp.zeros(2))
@@ -295,8 +305,10 @@ def test_a_wreck_is_pushed_and_a_cone_is_not_in_the_way():
         ahead = np.array([np.cos(thing.heading), np.sin(thing.heading)])
         place = np.array([thing.x, thing.y]) - 8 * ahead
         ego = vehicle.place(
-            jnp.array([*place, thing.heading], jnp.float32), jnp.asarray(8 * ahead, jnp.float32),
-            jnp.zeros(()), jnp.zeros(2),
+            jnp.array([*place, thing.heading], jnp.float32),
+            jnp.asarray(8 * ahead, jnp.float32),
+            jnp.zeros(()),
+            jnp.zeros(2),
         )
         state = state.replace(ego=ego)
         step = jax.jit(lambda s, p=params, w=world: w.transition(None, s, jnp.zeros(2), p))

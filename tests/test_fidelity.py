@@ -21,8 +21,10 @@ def figures(recordings):
 @pytest.mark.parametrize(
     ("name", "bound"),
     [
-        ("obs_max_abs_error", 2e-3), ("lidar_mean_abs_error", 0.01),
-        ("position_error_1s_median", 0.10), ("position_error_1s_p95", 0.5),
+        ("obs_max_abs_error", 2e-3),
+        ("lidar_mean_abs_error", 0.01),
+        ("position_error_1s_median", 0.10),
+        ("position_error_1s_p95", 0.5),
     ],
 )
 def test_errors_against_the_recordings(figures, name, bound):

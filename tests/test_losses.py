@@ -77,6 +77,8 @@ def test_gradients_are_finite_at_the_corners_of_the_action_box(kind):
     corner = jnp.ones((4, 2))
     for mean in (corner, -corner, 0 * corner):
         for beta in (0.1, 1e3):
-            gradient = jax.grad(lambda m, b=beta: cpo_loss(m, corner, m, -corner, b, 1.0, kind)[0])(mean)
+            gradient = jax.grad(lambda m, b=beta: cpo_loss(m, corner, m, -corner, b, 1.0, kind)[0])(
+                mean
+            )
             assert bool(jnp.all(jnp.isfinite(gradient)))
         assert bool(jnp.all(jnp.isfinite(jax.grad(lambda m: bc_loss(m, corner, kind)[0])(mean))))

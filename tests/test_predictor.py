@@ -26,9 +26,7 @@ def test_a_prediction_is_the_transition_in_a_loop_and_leaves_no_trace(world, sta
     transition = selected_transition(world, predictor)
     before = jax.tree.map(np.array, start)
     predicted = jax.jit(
-        lambda s: predict(
-            world, transition, jax.random.key(1), s, action, params, H, observe=True
-        )
+        lambda s: predict(world, transition, jax.random.key(1), s, action, params, H, observe=True)
     )(start)
     for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(start), strict=True):
         np.testing.assert_array_equal(old, new)
@@ -57,16 +55,12 @@ def test_the_real_step_is_the_same_with_and_without_a_prediction(world, start):
         return world.transition(None, state, action, params)[0], ahead.reward.sum()
 
     plain = jax.jit(lambda s: world.transition(None, s, action, params)[0])(start)
-    for a, b in zip(
-        jax.tree.leaves(plain), jax.tree.leaves(with_lookahead(start)[0]), strict=True
-    ):
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(with_lookahead(start)[0]), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 def test_the_kinematic_prediction_freezes_traffic(world, start):
-    state, _ = world.transition_kinematic(
-        None, start, jnp.array([0.0, 1.0]), world.default_params
-    )
+    state, _ = world.transition_kinematic(None, start, jnp.array([0.0, 1.0]), world.default_params)
     np.testing.assert_array_equal(state.traffic.long, start.traffic.long)
     assert float(state.ego.pose[0]) != float(start.ego.pose[0])
 
@@ -78,7 +72,8 @@ def test_noise_has_the_stated_length():
         np.testing.assert_allclose(
             np.linalg.norm(noise, axis=-1),
             epsilon * np.linalg.norm(observation, axis=-1),
-            rtol=1e-3, atol=1e-5,
+            rtol=1e-3,
+            atol=1e-5,
         )
 
 

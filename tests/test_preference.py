@@ -18,8 +18,12 @@ def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=())
     steps = jnp.arange(M) < valid
     return Trajectory(
         observation=jnp.arange(M * O, dtype=jnp.float32).reshape(M, O),
-        reward=jnp.where(steps, reward, 0.0), speed=jnp.where(steps, speed, 0.0),
-        unsafe=at(unsafe), success=at(success), terminated=at(ended), valid=steps,
+        reward=jnp.where(steps, reward, 0.0),
+        speed=jnp.where(steps, speed, 0.0),
+        unsafe=at(unsafe),
+        success=at(success),
+        terminated=at(ended),
+        valid=steps,
     )
 
 
@@ -27,10 +31,18 @@ def interaction(takeover, predicted):
     flag = jnp.asarray(takeover)
     zero = jnp.zeros(())
     return Interaction(
-        observation=jnp.full(O, -1.0), next_observation=jnp.zeros(O),
-        novice_action=jnp.full(A, 0.25), expert_action=jnp.full(A, 0.75),
-        executed_action=jnp.zeros(A), takeover=flag, takeover_start=flag, reward=zero, cost=zero,
-        terminated=flag, truncated=flag, predicted=predicted,
+        observation=jnp.full(O, -1.0),
+        next_observation=jnp.zeros(O),
+        novice_action=jnp.full(A, 0.25),
+        expert_action=jnp.full(A, 0.75),
+        executed_action=jnp.zeros(A),
+        takeover=flag,
+        takeover_start=flag,
+        reward=zero,
+        cost=zero,
+        terminated=flag,
+        truncated=flag,
+        predicted=predicted,
     )
 
 

@@ -12,8 +12,14 @@ from ppl_jax.training import make_train
 from tests.probes import Probe
 
 TINY = TrainConfig(
-    total_steps=600, batch_size=32, hidden=(32,), prediction_horizon=6, decision_interval=5,
-    max_preference_horizon=6, human_capacity=600, preference_capacity=2000,
+    total_steps=600,
+    batch_size=32,
+    hidden=(32,),
+    prediction_horizon=6,
+    decision_interval=5,
+    max_preference_horizon=6,
+    human_capacity=600,
+    preference_capacity=2000,
 )
 HP = HParams(learning_rate=3e-3)
 
@@ -47,7 +53,11 @@ def test_the_released_settings_run_and_solve_the_probe():
     probe = Probe()
     config, hparams = reference()
     config = dataclasses.replace(
-        config, total_steps=600, batch_size=32, hidden=(32,), predictor="simulator",
+        config,
+        total_steps=600,
+        batch_size=32,
+        hidden=(32,),
+        predictor="simulator",
     )
     fns = make_train(probe, probe.scripted_expert, ALGORITHMS["ppl"], config)
     hparams = hparams.replace(learning_rate=3e-3, min_return=-3.0)
@@ -58,13 +68,16 @@ def test_the_released_settings_run_and_solve_the_probe():
 def test_without_an_expert_in_reach_nothing_is_learnt():
     # a gate that never fires: no data, no update
     probe, fns = functions()
-    algorithm = fns.algorithm._replace(decide=lambda state, trajectory, hparams: jnp.zeros((), bool))
+    algorithm = fns.algorithm._replace(
+        decide=lambda state, trajectory, hparams: jnp.zeros((), bool)
+    )
     fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
     start = fns.init(jax.random.key(0), HP)
     learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
     assert int(learner.counters.human_data) == 0
     for a, b in zip(
-        jax.tree.leaves(start.algorithm.learned), jax.tree.leaves(learner.algorithm.learned),
+        jax.tree.leaves(start.algorithm.learned),
+        jax.tree.leaves(learner.algorithm.learned),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
@@ -74,21 +87,25 @@ def test_a_vmapped_batch_is_the_runs_one_by_one():
     _, fns = functions(total_steps=100)
     seeds = jnp.arange(4)
     grid = HParams(
-        preference_horizon=jnp.array([1.0, 3.0, 6.0, 4.0]), beta=jnp.array([0.1, 0.3, 1.0, 0.0]),
+        preference_horizon=jnp.array([1.0, 3.0, 6.0, 4.0]),
+        beta=jnp.array([0.1, 0.3, 1.0, 0.0]),
         prediction_noise=jnp.array([0.0, 0.1, 0.2, 0.0]),
-        expert_noise=jnp.array([0.0, 0.0, 0.1, 0.2]), learning_rate=jnp.full(4, 1e-3),
+        expert_noise=jnp.array([0.0, 0.0, 0.1, 0.2]),
+        learning_rate=jnp.full(4, 1e-3),
     )
-    axes = HParams(**{
-        f.name: 0 if jnp.ndim(getattr(grid, f.name)) else None for f in dataclasses.fields(grid)
-    })
+    axes = HParams(
+        **{f.name: 0 if jnp.ndim(getattr(grid, f.name)) else None for f in dataclasses.fields(grid)}
+    )
     keys = jax.vmap(jax.random.key)(seeds)
     together, metrics = jax.jit(jax.vmap(fns.train, in_axes=(0, axes)))(keys, grid)
     train = jax.jit(fns.train)
     for i in range(4):
-        one = HParams(**{
-            f.name: value[i] if jnp.ndim(value := getattr(grid, f.name)) else value
-            for f in dataclasses.fields(grid)
-        })
+        one = HParams(
+            **{
+                f.name: value[i] if jnp.ndim(value := getattr(grid, f.name)) else value
+                for f in dataclasses.fields(grid)
+            }
+        )
         alone, alone_metrics = train(keys[i], jax.tree.map(jnp.float32, one))
         assert int(alone.counters.human_data) == int(together.counters.human_data[i])
         for a, b in zip(
@@ -100,7 +117,7 @@ def test_a_vmapped_batch_is_the_runs_one_by_one():
         np.testing.assert_allclose(
             alone_metrics["train/loss_bc"], metrics["train/loss_bc"][i], rtol=2e-2, atol=1e-4
         )
-    assert train._cache_size() == 1  # another L, beta, noise, learning rate or seed compiles nothing
+    assert train._cache_size() == 1  # another L, beta, noise or seed compiles nothing
 
 
 def test_chunks_are_the_whole_run_bit_for_bit():
@@ -132,7 +149,8 @@ def test_buffers_hold_what_algorithm_1_says():
     assert count <= held <= 2 * count
     np.testing.assert_allclose(
         np.asarray(pairs.data.preferred_action)[:held, 0],
-        0.6 * np.asarray(pairs.data.observation)[:held, 0], atol=1e-6,
+        0.6 * np.asarray(pairs.data.observation)[:held, 0],
+        atol=1e-6,
     )
     # each taken-over step's first predicted error is the present one plus the novice's miss
     novice = np.asarray(pairs.data.rejected_action)[:held, 0]

@@ -95,9 +95,7 @@ def curve_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
     for road, lane in zip(roads, parts, strict=True):
         network.add_road(road, lane, len(lanes))
         network.add_oncoming(road)
-    return Block(
-        "C", network, entry, roads[1:], inner=roads, accident_roads=roads, parameters=p
-    )
+    return Block("C", network, entry, roads[1:], inner=roads, accident_roads=roads, parameters=p)
 
 
 RAMP_RADIUS, RAMP_ANGLE, RAMP_LENGTH, RAMP_CONNECT = 40.0, math.radians(10.0), 15.0, 20.0
@@ -115,7 +113,9 @@ def in_ramp_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block
     approach_lane = extend(lanes[-1], _RAMP_SPAN + 10.0)
     merge_lane = extend(approach_lane, p["length"] + p["extension_length"])
     for road, lane in (
-        (approach, approach_lane), (merge, merge_lane), (socket, extend(merge_lane, 20.0)),
+        (approach, approach_lane),
+        (merge, merge_lane),
+        (socket, extend(merge_lane, 20.0)),
     ):
         network.add_road(road, lane, count, kerb=False)
         network.add_oncoming(road)
@@ -137,8 +137,13 @@ def in_ramp_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block
     network.add_lane(merge, acceleration)
     network.add_lane(DECORATION, _extension(acceleration.end, p["extension_length"], width, SHRINK))
     return Block(
-        "r", network, entry, (socket,), inner=(approach, merge, *ramp),
-        accident_roads=(approach, merge), parameters=p,
+        "r",
+        network,
+        entry,
+        (socket,),
+        inner=(approach, merge, *ramp),
+        accident_roads=(approach, merge),
+        parameters=p,
     )
 
 
@@ -166,8 +171,13 @@ def out_ramp_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bloc
     for road, lane in zip(ramp, (right_bend, connect, left_bend, last), strict=True):
         network.add_lane(road, lane)
     return Block(
-        "R", network, entry, (socket,), inner=(leave, socket, *ramp),
-        accident_roads=(leave, socket), parameters=p,
+        "R",
+        network,
+        entry,
+        (socket,),
+        inner=(leave, socket, *ramp),
+        accident_roads=(leave, socket),
+        parameters=p,
     )
 
 
@@ -246,12 +256,8 @@ def roundabout_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bl
         around, after_ring = bend(
             tool(after_enter), 10.0, ring_radius, 2 * angle - math.pi / 2, clockwise=False
         )
-        leave, exit_lane = bend(
-            tool(after_ring), EXIT_LENGTH, exit_radius, angle, clockwise=True
-        )
-        inner = bend(
-            tool(after_ring), 5.0, inner_radius, math.pi - 2 * angle, clockwise=False
-        )[0]
+        leave, exit_lane = bend(tool(after_ring), EXIT_LENGTH, exit_radius, angle, clockwise=True)
+        inner = bend(tool(after_ring), 5.0, inner_radius, math.pi - 2 * angle, clockwise=False)[0]
         way_out = names[2] if part < 3 else reverse_road(entry)[0]
         network.add_road((incoming[1], names[0]), enter, count)
         network.add_road((names[0], names[1]), around, count)
@@ -267,8 +273,13 @@ def roundabout_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bl
         following = node(number, "O", (part + 1) % 4, 0)
         network.add_road((names[1], following), inner, count, kerb=False)
     return Block(
-        "O", network, entry, tuple(sockets), arms=tuple(reverse_road(road) for road in sockets),
-        inner=tuple(ring), parameters=p,
+        "O",
+        network,
+        entry,
+        tuple(sockets),
+        arms=tuple(reverse_road(road) for road in sockets),
+        inner=tuple(ring),
+        parameters=p,
     )
 
 
@@ -306,7 +317,8 @@ BLOCK_KINDS: dict[str, BlockKind] = {
     "O": BlockKind(
         0.1,
         lambda rng: {
-            **_uniform(exit_radius=(5, 15), inner_radius=(15, 45))(rng), "angle": 60.0,
+            **_uniform(exit_radius=(5, 15), inner_radius=(15, 45))(rng),
+            "angle": 60.0,
         },
         roundabout_block,
     ),

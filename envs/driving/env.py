@@ -16,7 +16,15 @@ from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import traffic as traffic_model
 from envs.driving import vehicle
-from envs.driving.geometry import box_contact, circle_depth, to_body, touches_sidewalk
+from envs.driving.geometry import (
+    box_contact,
+    circle_depth,
+    lane_coordinates,
+    lane_heading,
+    lane_position,
+    to_body,
+    touches_sidewalk,
+)
 from envs.driving.maps import MapSettings, generate
 from envs.driving.recorded import load_recordings
 from envs.driving.scenario import (
@@ -176,7 +184,7 @@ def reward_and_cost(
     on_reference = lanes.route[navigation.lane] == navigation.road
     lane_index = jnp.where(on_reference, navigation.lane, scenario.route_lane[navigation.road])
     lane = take(lanes, lane_index)
-    before, _ = nav.lane_coordinates(lane, ego.last_pose[:2])
+    before, _ = lane_coordinates(lane, ego.last_pose[:2])
     speed = jnp.sqrt(jnp.sum(ego.velocity**2))
     reward = (
         params.progress_weight * (long[lane_index] - before)
@@ -246,8 +254,8 @@ def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
     """The ego standing 5 m along its lane, all traffic parked."""
     lane = take(scenario.lanes, scenario.spawn_lane)
     long, zero = jnp.float32(SPAWN_LONG), jnp.zeros((), jnp.float32)
-    position = nav.lane_position(lane, long, zero)
-    pose = jnp.append(position, nav.lane_heading(lane, long))
+    position = lane_position(lane, long, zero)
+    pose = jnp.append(position, lane_heading(lane, long))
     ego = vehicle.place(pose, jnp.zeros(2), zero, jnp.zeros(2))
     navigation, found = nav.localise(scenario, nav.start(scenario), pose)
     traffic = traffic_model.start(scenario)
@@ -297,9 +305,7 @@ class Driving(Environment):
         del key  # a scenario is deterministic
         return take(params.starts, index)
 
-    def reset(
-        self, key: jax.Array, params: DrivingParams
-    ) -> tuple[jax.Array, DrivingState]:
+    def reset(self, key: jax.Array, params: DrivingParams) -> tuple[jax.Array, DrivingState]:
         """A random scenario's start."""
         index = jax.random.randint(key, (), 0, self.scenario_count(params))
         return params.start_observations[index], take(params.starts, index)
@@ -311,13 +317,16 @@ class Driving(Environment):
         del key  # the world is deterministic
         scenario = take(params.scenarios, state.scenario)
         lane = take(scenario.lanes, state.navigation.lane)
-        ego_long, _ = nav.lane_coordinates(lane, state.ego.pose[:2])
+        ego_long, _ = lane_coordinates(lane, state.ego.pose[:2])
         speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
         traffic = traffic_model.advance(
             scenario, state.traffic, state.navigation.lane, ego_long, speed, state.blocked
         )
         ego = vehicle.drive(
-            state.ego, action, scenario.engine_force, scenario.brake_force,
+            state.ego,
+            action,
+            scenario.engine_force,
+            scenario.brake_force,
             scenario.wheel_friction,
         )
         return self._finish(params, scenario, state, ego, traffic, solid=True)
@@ -380,8 +389,7 @@ class Driving(Environment):
             truncated=time >= HORIZON,
             cost=cost,
             success=events.arrived,
-            unsafe=(events.off_road | events.crash_vehicle | events.crash_object)
-            & ~events.arrived,
+            unsafe=(events.off_road | events.crash_vehicle | events.crash_object) & ~events.arrived,
             progress=navigation.travelled / scenario.route_length,
             speed=jnp.sqrt(jnp.sum(ego.velocity**2)),
         )
@@ -431,9 +439,7 @@ def make_params(
         for field in dataclasses.fields(DrivingParams)
         if isinstance(field.default, float)
     }
-    return DrivingParams(
-        scenarios=pool, starts=starts, start_observations=observations, **weights
-    )
+    return DrivingParams(scenarios=pool, starts=starts, start_observations=observations, **weights)
 
 
 def make_driving(

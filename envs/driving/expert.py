@@ -180,9 +180,7 @@ def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Th
     reference = scenario.route_lane[jnp.maximum(lanes.route[own], 0)]
     share = traffic.long / lanes.length[own] * lanes.length[reference]
     offset = traffic.number * lanes.width[own] + traffic.lateral
-    half = jnp.concatenate(
-        [plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)]
-    )
+    half = jnp.concatenate([plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)])
     ahead = (
         _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, objects.along]))
         - ego_along

@@ -29,7 +29,7 @@ from envs.driving import env as driving
 from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import vehicle
-from envs.driving.geometry import lane_coordinates
+from envs.driving.geometry import lane_coordinates, on_lanes
 from envs.driving.recorded import load_recording, recording_paths
 from envs.driving.scenario import Capacity, Scenario, pack
 
@@ -51,9 +51,9 @@ class Recording:
             self.steps = len(z["action"])
 
             def padded(array, size):
-                return np.concatenate(
-                    [array, np.repeat(array[-1:], size - len(array), 0)]
-                ).astype(np.float32)
+                return np.concatenate([array, np.repeat(array[-1:], size - len(array), 0)]).astype(
+                    np.float32
+                )
 
             self.ego = padded(z["ego"], steps + 1)
             self.action = padded(z["action"], steps)
@@ -69,9 +69,7 @@ class Recording:
         for road_name, members in description.network.roads.items():
             for number in range(len(members)):
                 lanes[*road_name, number] = len(lanes)
-        lane = np.array(
-            [lanes[a, b, int(k)] for a, b, k in meta["lane_index_per_step"]], np.int32
-        )
+        lane = np.array([lanes[a, b, int(k)] for a, b, k in meta["lane_index_per_step"]], np.int32)
         lane = np.concatenate([lane, np.repeat(lane[-1:], steps + 1 - len(lane))])
         self.road, self.lane, self.traffic = road, lane, traffic
         self.boxes = self._box_poses(meta["objects"], steps)
@@ -118,7 +116,11 @@ def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
     def one(ego, before, action, lane, road, traffic, boxes):
         _, lateral, left, right = _edges(scenario, lane, road, ego[:3])
         features = obs.ego_features(
-            scenario, _ego(ego, before, action), _navigation(lane, road), left, right,
+            scenario,
+            _ego(ego, before, action),
+            _navigation(lane, road),
+            left,
+            right,
             lateral[lane],
         )
         traffic_pose = traffic[:, :3].at[:, :2].add(SEEN_AHEAD * traffic[:, 3:5])
@@ -135,7 +137,7 @@ def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
 
     def one(ego, before, action, lane, road, traffic, boxes):
         long, lateral, left, right = _edges(scenario, lane, road, ego[:3])
-        on_lane = jnp.any(nav.on_lanes(scenario.lanes, long, lateral))
+        on_lane = jnp.any(on_lanes(scenario.lanes, long, lateral))
         found = nav.Localised(long, lateral, on_lane, left, right)
         navigation = _navigation(lane, road)
         state = _ego(ego, before, action)
@@ -146,9 +148,7 @@ def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
             touch.vehicle,
             touch.object,
         )
-        reward, _ = driving.reward_and_cost(
-            params, scenario, events, navigation, long, state
-        )
+        reward, _ = driving.reward_and_cost(params, scenario, events, navigation, long, state)
         return reward
 
     return jax.vmap(one)(ego, before, action, lane, road, traffic, boxes)
@@ -162,7 +162,10 @@ def _replay(scenario, ego, before, last_action, actions):
     def one(ego, before, last_action, actions):
         def step(state, action):
             state = vehicle.drive(
-                state, action, scenario.engine_force, scenario.brake_force,
+                state,
+                action,
+                scenario.engine_force,
+                scenario.brake_force,
                 scenario.wheel_friction,
             )
             return state, state.pose
@@ -197,14 +200,23 @@ def compare(recordings: list[Recording]) -> dict[str, float]:
     executed = np.concatenate([np.zeros_like(action[:, :1]), action], 1)
     ours = np.asarray(_observe(scenario, ego, before, executed, lane, road, traffic, boxes))
     rewards = _reward(
-        scenario, ego[:, 1:], ego[:, :-1], action, lane[:, 1:], road[:, 1:], traffic[:, 1:],
+        scenario,
+        ego[:, 1:],
+        ego[:, :-1],
+        action,
+        lane[:, 1:],
+        road[:, 1:],
+        traffic[:, 1:],
         boxes[:, 1:],
     )
     windows = action.shape[1] - WINDOW + 1
     index = np.arange(windows)[:, None] + np.arange(WINDOW)
     track = np.asarray(
         _replay(
-            scenario, ego[:, :windows], before[:, :windows], executed[:, :windows],
+            scenario,
+            ego[:, :windows],
+            before[:, :windows],
+            executed[:, :windows],
             action[:, index],
         )
     )

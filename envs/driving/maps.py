@@ -11,8 +11,15 @@ import dataclasses
 import numpy as np
 
 from envs.driving.blocks import BLOCK_KINDS, Block, first_block, traffic_roads
-from envs.driving.roads import DECORATION, FIRST_NODES, Lane, Road, RoadNetwork, is_oncoming
-from envs.driving.roads import reverse_road
+from envs.driving.roads import (
+    DECORATION,
+    FIRST_NODES,
+    Lane,
+    Road,
+    RoadNetwork,
+    is_oncoming,
+    reverse_road,
+)
 from envs.driving.scenario import SIDEWALK, Description, ObjectSpec, VehicleSpec
 
 ENGINE_FORCE, BRAKE_FORCE, WHEEL_FRICTION = (750.0, 850.0), (80.0, 180.0), 0.9
@@ -74,9 +81,7 @@ class MapSettings:
                 f"accident_probability must be in [0, 1], got {self.accident_probability}"
             )
         if not self.kinds or set(self.kinds) - set(BLOCK_KINDS):
-            raise ValueError(
-                f"kinds must be letters of {''.join(BLOCK_KINDS)}, got {self.kinds!r}"
-            )
+            raise ValueError(f"kinds must be letters of {''.join(BLOCK_KINDS)}, got {self.kinds!r}")
 
 
 def generate(number: int, settings: MapSettings | None = None) -> Description:
@@ -190,7 +195,12 @@ def _accidents(
 
 
 def _placed(
-    kind: str, lane: Lane, name: tuple[Road, int], long: float, length: float, width: float,
+    kind: str,
+    lane: Lane,
+    name: tuple[Road, int],
+    long: float,
+    length: float,
+    width: float,
     lateral: float = 0.0,
 ) -> ObjectSpec:
     x, y = lane.position(long, lateral)
@@ -206,7 +216,12 @@ def _cones(lane: Lane, name: tuple[Road, int], on_left: bool) -> list[ObjectSpec
     sign = 1.0 if on_left else -1.0
     return [
         _placed(
-            "cone", lane, name, middle + 2.0 * (first + i), 0.2, 0.2,
+            "cone",
+            lane,
+            name,
+            middle + 2.0 * (first + i),
+            0.2,
+            0.2,
             sign * (offset - lane.width / 2),
         )
         for i, offset in enumerate(offsets)
@@ -248,8 +263,14 @@ def _traffic(
                 model = _draw_model(rng)
                 vehicles.append(
                     VehicleSpec(
-                        model.length, model.width, block.entry, (road, number), long, nodes,
-                        patience=int(rng.integers(50)), mass=model.mass,
+                        model.length,
+                        model.width,
+                        block.entry,
+                        (road, number),
+                        long,
+                        nodes,
+                        patience=int(rng.integers(50)),
+                        mass=model.mass,
                         engine_force=float(rng.uniform(*model.engine)),
                         brake_force=float(rng.uniform(*model.brake)),
                     )

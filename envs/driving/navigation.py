@@ -10,8 +10,6 @@ import jax.numpy as jnp
 
 from envs.driving.geometry import (
     lane_coordinates,
-    lane_heading,
-    lane_position,
     on_lanes,
     runs_along,
 )
@@ -77,9 +75,7 @@ def localise(
     long, lateral = lane_coordinates(lanes, pose[:2])
     inside = on_lanes(lanes, long, lateral)
     along = runs_along(lanes, pose)
-    distance = (
-        jnp.abs(lateral) + jnp.maximum(long - lanes.length, 0.0) + jnp.maximum(-long, 0.0)
-    )
+    distance = jnp.abs(lateral) + jnp.maximum(long - lanes.length, 0.0) + jnp.maximum(-long, 0.0)
     last_road = scenario.route_roads - 1
     is_next = (lanes.route == navigation.road + 1) & (navigation.road < last_road)
     rank = jnp.where(lanes.route == navigation.road, 0.0, jnp.where(is_next, 1e3, 2e3))

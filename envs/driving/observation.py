@@ -28,8 +28,8 @@ from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import CONTROL_STEP, Ego
 
 SIZE = 19 + lidar.RAYS
-# a network sees (observation - MEAN) / SCALE: a ray that hits nothing is 0, and the few numbers that
-# tell the place on the road weigh more than the many rays
+# a network sees (observation - MEAN) / SCALE: a ray that hits nothing is 0, and the few numbers
+# that tell the place on the road weigh more than the many rays
 MEAN = np.concatenate([np.full(19, 0.5), np.ones(lidar.RAYS)]).astype(np.float32)
 SCALE = np.concatenate([np.full(19, 0.1), np.full(lidar.RAYS, 3.0)]).astype(np.float32)
 _FULL_WIDTH = 18.0  # m: (3 + 1) lanes of 4.5 m
@@ -49,17 +49,23 @@ def _checkpoint(scenario: Scenario, road: jax.Array, size: jax.Array, width: jax
     is_arc = lane.turn != 0
     radius = jnp.where(is_arc, lane.radius / (_LARGEST_RADIUS + size * width), 0.0)
     angle = jnp.where(is_arc, lane.angle / _LARGEST_ANGLE, 0.0)
-    return jnp.stack([
-        0.5 + local[0] / (2 * _CHECKPOINT_RANGE),
-        0.5 + local[1] / (2 * _CHECKPOINT_RANGE),
-        radius,
-        0.5 - 0.5 * lane.turn,
-        0.5 + 0.5 * angle,
-    ])
+    return jnp.stack(
+        [
+            0.5 + local[0] / (2 * _CHECKPOINT_RANGE),
+            0.5 + local[1] / (2 * _CHECKPOINT_RANGE),
+            radius,
+            0.5 - 0.5 * lane.turn,
+            0.5 + 0.5 * angle,
+        ]
+    )
 
 
 def ego_features(
-    scenario: Scenario, ego: Ego, navigation: Navigation, left: jax.Array, right: jax.Array,
+    scenario: Scenario,
+    ego: Ego,
+    navigation: Navigation,
+    left: jax.Array,
+    right: jax.Array,
     lateral: jax.Array,
 ) -> jax.Array:
     """Values 0-18.
@@ -87,20 +93,20 @@ def ego_features(
     speed = jnp.sqrt(jnp.sum(ego.velocity**2)) * 3.6
     yaw = jnp.abs(wrap(ego.pose[2] - ego.last_pose[2])) / CONTROL_STEP
     following = jnp.minimum(navigation.road + 1, scenario.route_roads - 1)
-    state = jnp.stack([
-        left / _FULL_WIDTH,
-        right / _FULL_WIDTH,
-        0.5 + 0.5 * jnp.sum(normal * heading),
-        (speed + 1.0) / 81.0,
-        (ego.action[0] / 60.0 + 1.0) / 2.0,
-        (ego.action[0] + 1.0) / 2.0,
-        (ego.action[1] + 1.0) / 2.0,
-        yaw,
-        (lateral * 2.0 / _WIDEST_LANE + 1.0) / 2.0,
-    ])
-    ends = [
-        _checkpoint(scenario, road, size, width, ego) for road in (navigation.road, following)
-    ]
+    state = jnp.stack(
+        [
+            left / _FULL_WIDTH,
+            right / _FULL_WIDTH,
+            0.5 + 0.5 * jnp.sum(normal * heading),
+            (speed + 1.0) / 81.0,
+            (ego.action[0] / 60.0 + 1.0) / 2.0,
+            (ego.action[0] + 1.0) / 2.0,
+            (ego.action[1] + 1.0) / 2.0,
+            yaw,
+            (lateral * 2.0 / _WIDEST_LANE + 1.0) / 2.0,
+        ]
+    )
+    ends = [_checkpoint(scenario, road, size, width, ego) for road in (navigation.road, following)]
     return jnp.clip(jnp.concatenate([state, *ends]), 0.0, 1.0)
 
 

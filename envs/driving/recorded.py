@@ -78,8 +78,13 @@ def _lane(entry: dict, taper: int) -> Lane:
     kerb = entry["line_types"][1] == "ROAD_EDGE_BOUNDARY"
     if entry["type"] == "CircularLane":
         return arc(
-            entry["center"], entry["radius"], entry["start_phase"], entry["angle"],
-            entry["direction"], entry["width"], kerb,
+            entry["center"],
+            entry["radius"],
+            entry["start_phase"],
+            entry["angle"],
+            entry["direction"],
+            entry["width"],
+            kerb,
         )
     return straight(entry["start"], entry["end"], entry["width"], kerb, taper)
 
@@ -93,7 +98,12 @@ def _object(entry: dict) -> ObjectSpec:
     if kind == "barrier":  # its "length" of 2 m lies across the lane
         length, width = width, length
     return ObjectSpec(
-        kind, x, y, heading, length, entry["radius"] if round_kind else width,
+        kind,
+        x,
+        y,
+        heading,
+        length,
+        entry["radius"] if round_kind else width,
         None if lane is None else ((lane[0], lane[1]), int(lane[2])),
     )
 
@@ -101,8 +111,14 @@ def _object(entry: dict) -> ObjectSpec:
 def _vehicle(entry: dict) -> VehicleSpec:
     road, number = tuple(entry["spawn_lane_index"][:2]), int(entry["spawn_lane_index"][2])
     return VehicleSpec(
-        entry["length"], entry["width"], tuple(entry["trigger_road"]), (road, number),
-        entry["spawn_longitude"], tuple(entry["destination_checkpoints"]), patience=0,
-        mass=entry["mass"], engine_force=entry["max_engine_force"],
+        entry["length"],
+        entry["width"],
+        tuple(entry["trigger_road"]),
+        (road, number),
+        entry["spawn_longitude"],
+        tuple(entry["destination_checkpoints"]),
+        patience=0,
+        mass=entry["mass"],
+        engine_force=entry["max_engine_force"],
         brake_force=entry["max_brake_force"],
     )

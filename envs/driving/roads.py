@@ -86,9 +86,7 @@ class Lane:
 def straight(start, end, width: float, kerb: bool = False, taper: int = STRAIGHT) -> Lane:
     """A straight lane between two points."""
     start, end = np.asarray(start, float), np.asarray(end, float)
-    return Lane(
-        start, end, float(np.hypot(*(end - start))), width, kerb=kerb, taper=taper
-    )
+    return Lane(start, end, float(np.hypot(*(end - start))), width, kerb=kerb, taper=taper)
 
 
 def arc(center, radius: float, phase: float, angle: float, turn: int, width: float, kerb=False):
@@ -99,8 +97,16 @@ def arc(center, radius: float, phase: float, angle: float, turn: int, width: flo
         return center + radius * np.array([np.cos(phi), np.sin(phi)])
 
     return Lane(
-        point(phase), point(phase + turn * angle), radius * angle, width, turn, center, radius,
-        phase, angle, kerb,
+        point(phase),
+        point(phase + turn * angle),
+        radius * angle,
+        width,
+        turn,
+        center,
+        radius,
+        phase,
+        angle,
+        kerb,
     )
 
 
@@ -110,7 +116,7 @@ def extend(lane: Lane, length: float, kerb: bool = False) -> Lane:
 
 
 def bend(lane: Lane, length: float, radius: float, angle: float, clockwise: bool, kerb=False):
-    """An arc that leaves the end of the straight `lane`, and the straight of `length` m after it."""
+    """An arc that leaves the end of a straight lane, and the straight of `length` m after it."""
     sign = 1 if clockwise else -1
     right = lane.position(0.0, 1.0) - lane.position(0.0, 0.0)
     center = lane.position(lane.length, sign * radius)
@@ -128,8 +134,13 @@ def beside(lane: Lane, offset: float, kerb: bool) -> Lane:
             lane.position(0.0, offset), lane.position(lane.length, offset), lane.width, kerb
         )
     return arc(
-        lane.center, lane.radius + offset * lane.turn, lane.phase, lane.angle, lane.turn,
-        lane.width, kerb,
+        lane.center,
+        lane.radius + offset * lane.turn,
+        lane.phase,
+        lane.angle,
+        lane.turn,
+        lane.width,
+        kerb,
     )
 
 
@@ -182,8 +193,12 @@ class RoadNetwork:
             )
         else:
             lane = arc(
-                last.center, last.radius + offset * last.turn,
-                last.phase + last.turn * last.angle, last.angle, -last.turn, last.width,
+                last.center,
+                last.radius + offset * last.turn,
+                last.phase + last.turn * last.angle,
+                last.angle,
+                -last.turn,
+                last.width,
             )
         self.add_road(reverse_road(road), lane, len(lanes), kerb=kerb)
 

@@ -267,7 +267,9 @@ def pack(description: Description, capacity: Capacity) -> Scenario:
         number=np.int32(d.number),
         lanes=_pack_lanes(lanes, d.network, d.nodes, route, capacity.lanes),
         kerbs=_padded(
-            [i for i, (_, _, lane) in enumerate(lanes) if _has_kerb(lane)], capacity.kerbs, -1,
+            [i for i, (_, _, lane) in enumerate(lanes) if _has_kerb(lane)],
+            capacity.kerbs,
+            -1,
             np.int32,
         ),
         route_lane=_padded([index[r, 0] for r in route], capacity.roads, 0, np.int32),
@@ -375,11 +377,13 @@ def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
         ),
         box_half=_padded(
             np.array([[o.length / 2, o.width / 2] for o in boxes]).reshape(-1, 2),
-            capacity.boxes, 0.1,
+            capacity.boxes,
+            0.1,
         ),
         box_is_vehicle=_padded([o.kind == "vehicle" for o in boxes], capacity.boxes, False, bool),
         circle=_padded(
-            np.array([[o.x, o.y, o.width] for o in circles]).reshape(-1, 3), capacity.circles,
+            np.array([[o.x, o.y, o.width] for o in circles]).reshape(-1, 3),
+            capacity.circles,
             np.array([_FAR, _FAR, 0.1]),
         ),
         lane=np.concatenate([box_lane, circle_lane]),

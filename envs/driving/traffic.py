@@ -118,12 +118,14 @@ def advance(
     present = status != REMOVED
     objects = scenario.objects
     other_lane = jnp.concatenate(
-        [jnp.where(present, lane, -2), ego_lane[None], jnp.where(objects.lane < 0, -2, objects.lane)]
+        [
+            jnp.where(present, lane, -2),
+            ego_lane[None],
+            jnp.where(objects.lane < 0, -2, objects.lane),
+        ]
     )
     other_long = jnp.concatenate([traffic.long, ego_long[None], objects.long])
-    other_speed = jnp.concatenate(
-        [traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)]
-    )
+    other_speed = jnp.concatenate([traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)])
     side = jnp.array([-1, 0, 1])
     beside_number = traffic.number[:, None] + side
     exists = (beside_number >= 0) & (beside_number < size[:, None])
@@ -147,14 +149,15 @@ def advance(
     free = exists & (behind_gap > SAFE_GAP)
     must = continues & ~leads[:, 1]
     toward = jnp.where(traffic.number + shift < 0, 2, 0)  # the neighbour on the road's side
-    forced_free = (
-        jnp.take_along_axis(free, toward[:, None], 1)[:, 0]
-        & (jnp.take_along_axis(gap, toward[:, None], 1)[:, 0] > SMALL_GAP)
+    forced_free = jnp.take_along_axis(free, toward[:, None], 1)[:, 0] & (
+        jnp.take_along_axis(gap, toward[:, None], 1)[:, 0] > SMALL_GAP
     )
     speed = traffic.speed * 3.6
     slow = (
-        seen[:, 1] & (jnp.abs(front_speed[:, 1] - TARGET_SPEED) > 3.0)
-        & (jnp.abs(speed - TARGET_SPEED) > 3.0) & (traffic.waited > PATIENCE)
+        seen[:, 1]
+        & (jnp.abs(front_speed[:, 1] - TARGET_SPEED) > 3.0)
+        & (jnp.abs(speed - TARGET_SPEED) > 3.0)
+        & (traffic.waited > PATIENCE)
     )
     better = free & (gap > SAFE_GAP) & (front_speed > front_speed[:, 1:2] + 10.0)
     better = better & (leads | ~continues[:, None])

@@ -117,12 +117,22 @@ def drive(
         w = -s * velocity[0] + c * velocity[1]
         front_side = w + FRONT * yaw_rate
         front_along, front_across = _wheel_impulses(
-            cd * u + sd * front_side, -sd * u + cd * front_side, engine, brake, FELT_MASS[0],
-            MASS * (GRAVITY * REAR - acceleration * MASS_HEIGHT) / WHEELBASE / 2, friction,
+            cd * u + sd * front_side,
+            -sd * u + cd * front_side,
+            engine,
+            brake,
+            FELT_MASS[0],
+            MASS * (GRAVITY * REAR - acceleration * MASS_HEIGHT) / WHEELBASE / 2,
+            friction,
         )
         rear_along, rear_across = _wheel_impulses(
-            u, w - REAR * yaw_rate, engine, brake, FELT_MASS[1],
-            MASS * (GRAVITY * FRONT + acceleration * MASS_HEIGHT) / WHEELBASE / 2, friction,
+            u,
+            w - REAR * yaw_rate,
+            engine,
+            brake,
+            FELT_MASS[1],
+            MASS * (GRAVITY * FRONT + acceleration * MASS_HEIGHT) / WHEELBASE / 2,
+            friction,
         )
         front_left = front_along * sd + front_across * cd
         du = 2 * (front_along * cd - front_across * sd + rear_along) / MASS

@@ -57,6 +57,7 @@ class Learned:
     Attributes:
         params: What acts while training.
         opt_state: Of Adam.
+        updates: Number of updates so far.
         average: Moving average of `params` over the last thousand or so updates: what is
             evaluated, saved and exported. One update per step on changing data leaves the last
             parameters noisy.
@@ -64,12 +65,13 @@ class Learned:
 
     params: PyTree
     opt_state: PyTree
+    updates: jax.Array
     average: PyTree
 
 
 def init_learned(params: PyTree) -> Learned:
     """Before the first update."""
-    return Learned(params, _ADAM.init(params), params)
+    return Learned(params, _ADAM.init(params), jnp.zeros((), jnp.int32), params)
 
 
 def adam_step(
@@ -80,11 +82,11 @@ def adam_step(
     def step(learned: Learned) -> Learned:
         updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, learned.params, updates)
-        count = opt_state.count.astype(jnp.float32)
+        count = learned.updates + 1.0
         decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
         average = jax.tree.map(
             lambda old, new: decay * old + (1 - decay) * new, learned.average, params
         )
-        return Learned(params, opt_state, average)
+        return Learned(params, opt_state, learned.updates + 1, average)
 
     return jax.lax.cond(do, step, lambda learned: learned, learned)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import flax.struct
@@ -44,9 +45,7 @@ def make_bc_only(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     return _make("bc_only", spec, config, with_preferences=False)
 
 
-def _make(
-    name: str, spec: WorldSpec, config: TrainConfig, with_preferences: bool
-) -> Algorithm:
+def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: bool) -> Algorithm:
     policy = make_policy(spec, config.hidden)
     rule = RULES[config.gate]
     shifted = config.pair_states == "shifted"
@@ -77,9 +76,10 @@ def _make(
             step.takeover[None],
         )
         if not with_preferences:
-            return state.replace(human_buffer=human)
+            return dataclasses.replace(state, human_buffer=human)
         pairs, mask = preference_pairs(step, hparams.preference_horizon, config.pair_states)
-        return state.replace(
+        return dataclasses.replace(
+            state,
             human_buffer=human,
             preference_buffer=buffers.add(state.preference_buffer, pairs, mask),
         )
@@ -95,10 +95,17 @@ def _make(
         total = hparams.bc_weight * bc
         if with_preferences:
             mean = policy.apply(params, pairs.observation)
-            rejected = policy.apply(params, pairs.rejected_observation) if shifted else mean
+            rejected = mean
+            if pairs.rejected_observation is not None:
+                rejected = policy.apply(params, pairs.rejected_observation)
             preference, more = cpo_loss(
-                mean, pairs.preferred_action, rejected, pairs.rejected_action, hparams.beta,
-                hparams.preference_bias, config.likelihood,
+                mean,
+                pairs.preferred_action,
+                rejected,
+                pairs.rejected_action,
+                hparams.beta,
+                hparams.preference_bias,
+                config.likelihood,
             )
             total = total + hparams.preference_weight * has_pairs * preference
             metrics = metrics | more
@@ -114,7 +121,7 @@ def _make(
             state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
         )
         learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
-        return state.replace(learned=learned), metrics
+        return dataclasses.replace(state, learned=learned), metrics
 
     def policy_params(state: PPLState) -> Any:
         return state.learned.average

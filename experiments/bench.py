@@ -1,0 +1,192 @@
+"""`ppl bench`: speed, as ratios within one run; medians of several repeats."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.driving.env import make_driving
+from experiments.runtime import device, versions
+from experiments.tables import print_table
+from ppl_jax.algorithms import ALGORITHMS
+from ppl_jax.config import PRESETS, as_arrays
+from ppl_jax.predictor import predict
+from ppl_jax.training import make_train
+
+STEPS = 200  # environment steps per timed call
+
+
+def _median_s(run: Callable[[], Any], repeats: int) -> float:
+    jax.block_until_ready(run())
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
+
+
+def bench(repeats: int, out: Path | None) -> dict[str, Any]:
+    """Measure and print; see the README for what the figures mean."""
+    began = time.perf_counter()
+    env = make_driving()
+    figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
+    figures |= _environment(env, repeats) | _lookahead(env, repeats) | _training(env, repeats)
+    figures |= _gradient(env, repeats, figures["train_ms_per_step"])
+    unit = 1 if sys.platform == "darwin" else 1024
+    figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
+    if out is not None:
+        out.write_text(
+            json.dumps(figures | {"versions": versions(), "device": device()}, indent=2) + "\n"
+        )
+    return figures
+
+
+def _environment(env: Any, repeats: int) -> dict[str, float]:
+    """Environment steps per second with the full observation and automatic reset."""
+    params, figures = env.default_params, {}
+    action = jnp.array([0.0, 0.4])
+    for worlds in (1, 64, 1024):
+        length = max(STEPS * 4 // worlds, 20)
+
+        def run(states: Any, key: jax.Array, worlds: int = worlds, length: int = length) -> Any:
+            def one(key: jax.Array, state: Any) -> Any:
+                obs, state, reward, *_ = env.step(key, state, action, params)
+                return state, obs[0] + obs[-1] + reward
+
+            def step(carry: Any, key: jax.Array) -> Any:
+                states, total = carry
+                if worlds == 1:
+                    states, seen = one(key, states)
+                else:
+                    states, seen = jax.vmap(one)(jax.random.split(key, worlds), states)
+                return (states, total + jnp.sum(seen)), None
+
+            return jax.lax.scan(step, (states, 0.0), jax.random.split(key, length))[0]
+
+        key = jax.random.key(0)
+        if worlds == 1:
+            _, states = env.reset(key, params)
+        else:
+            _, states = jax.vmap(env.reset, in_axes=(0, None))(
+                jax.random.split(key, worlds), params
+            )
+        program = jax.jit(run)
+        seconds = _median_s(lambda p=program, s=states, k=key: p(s, k), repeats)
+        figures[f"env_steps_per_s_{worlds}"] = worlds * length / seconds
+    return figures
+
+
+def _lookahead(env: Any, repeats: int) -> dict[str, float]:
+    """Predicted steps per second of the gate's lookahead in one world (no observations)."""
+    params, horizon, calls = env.default_params, 10, 100
+    _, state = env.reset(jax.random.key(0), params)
+
+    @jax.jit
+    def run(state: Any) -> jax.Array:
+        def call(total: jax.Array, _: None) -> Any:
+            action = jnp.stack([total * 1e-9, 0.5])
+            ahead = predict(env, env.transition, jax.random.key(0), state, action, params, horizon)
+            return total + jnp.sum(ahead.reward), None
+
+        return jax.lax.scan(call, jnp.zeros(()), None, length=calls)[0]
+
+    return {"predicted_steps_per_s": horizon * calls / _median_s(lambda: run(state), repeats)}
+
+
+def _training(env: Any, repeats: int) -> dict[str, float]:
+    """Milliseconds per training step, and how much of it each part takes.
+
+    A part's share is what a run costs more than the same run without that part.
+    """
+    config, hparams = PRESETS["default"]()
+    config = dataclasses.replace(config, total_steps=STEPS)
+    blocks = STEPS // config.decision_interval
+
+    def timed(make: Any) -> float:
+        functions = make_train(env, env.scripted_expert, make, config)
+        program = jax.jit(lambda learner: functions.run_chunk(learner, blocks), donate_argnums=0)
+        # a learner with data in its buffers
+        learner, _ = program(jax.jit(functions.init)(jax.random.key(0), hparams))
+        times = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            learner, _ = jax.block_until_ready(program(learner))
+            times.append((time.perf_counter() - began) / STEPS * 1e3)
+        return float(np.median(times))
+
+    def without(**parts: Any) -> Any:
+        def make(spec: Any, config: Any) -> Any:
+            return ALGORITHMS["ppl"](spec, config)._replace(**parts)
+
+        return make
+
+    def no_update(state: Any, key: jax.Array, hparams: Any) -> Any:
+        return state, {"none": jnp.zeros(())}
+
+    whole = timed(ALGORITHMS["ppl"])
+    no_gradient = timed(without(update=no_update))
+    no_store = timed(without(update=no_update, store=lambda state, step, hparams: state))
+    no_ahead = timed(
+        without(update=no_update, store=lambda state, step, hparams: state, uses_predictions=False)
+    )
+    return {
+        "train_ms_per_step": whole,
+        "share_gradient": (whole - no_gradient) / whole,
+        "share_buffers": max(no_gradient - no_store, 0.0) / whole,
+        "share_lookahead": max(no_store - no_ahead, 0.0) / whole,
+        "share_environment_and_gate": no_ahead / whole,
+    }
+
+
+def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
+    """FLOP/s of the update against a plain matrix product of its largest shape."""
+    config, hparams = PRESETS["default"]()
+    algorithm = ALGORITHMS["ppl"](env.spec, config)
+    state = algorithm.init(jax.random.key(0))
+    ones = jax.tree.map(jnp.ones_like, state.human_buffer.added) * config.batch_size
+    state = state.replace(
+        human_buffer=state.human_buffer.replace(added=ones),
+        preference_buffer=state.preference_buffer.replace(added=ones),
+    )
+    traced, updates = as_arrays(hparams), 50
+
+    @jax.jit
+    def run(state: Any) -> Any:
+        def step(learned: Any, key: jax.Array) -> Any:
+            return algorithm.update(state.replace(learned=learned), key, traced)[0].learned, None
+
+        return jax.lax.scan(step, state.learned, jax.random.split(jax.random.key(1), updates))[0]
+
+    seconds = _median_s(lambda: run(state), repeats) / updates
+    widths = [env.spec.observation_size, *config.hidden, env.spec.action_size]
+    products = [a * b for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    # forward and weight gradients of every layer, input gradients of all but the first
+    flops = 2 * 2 * config.batch_size * (3 * sum(products) - products[0])
+
+    rows, width = 2 * config.batch_size, config.hidden[0]
+    left, right = jnp.ones((rows, width)), jnp.ones((width, width))
+
+    @jax.jit
+    def multiply(left: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda x, _: ((x @ right) * 1e-3, None), left, None, length=200)[0]
+
+    plain = 200 * 2 * rows * width * width / _median_s(lambda: multiply(left), repeats)
+    return {
+        "update_ms": seconds * 1e3,
+        "update_gflops": flops / seconds / 1e9,
+        "plain_product_gflops": plain / 1e9,
+        "update_over_plain_product": flops / seconds / plain,
+        "update_share_of_step": seconds * 1e3 / train_ms,
+    }
