@@ -198,13 +198,18 @@ def save_frames(path: str | Path, frames: list[np.ndarray], rate: float = 10.0) 
             path, save_all=True, append_images=images[1:], duration=int(1000 / rate), loop=0
         )
     elif path.suffix == ".mp4":
-        import imageio_ffmpeg
-
-        height, width = frames[0].shape[:2]
-        writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=rate)
-        writer.send(None)
-        for frame in frames:
-            writer.send(np.ascontiguousarray(frame))
-        writer.close()
+        _save_mp4(path, frames, rate)
     else:
         raise ValueError(f"out must end in .gif, .mp4 or .png, got {str(path)!r}")
+
+
+def _save_mp4(path: Path, frames: list[np.ndarray], rate: float) -> None:
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=round(rate))
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())

@@ -45,7 +45,7 @@ def doctor() -> None:
     print("\nExtras")
     for module, extra, what in (
         ("PIL", "render", "pictures and GIFs"),
-        ("imageio_ffmpeg", "render", "MP4 films"),
+        ("av", "render", "MP4 films"),
         ("matplotlib", "plot", "figures"),
         ("mujoco", "manipulation", "the UR5e worlds"),
         ("brax", "brax", "the brax adapter"),

@@ -12,8 +12,8 @@ multivariate Laplace density: quadratic within w of mu (there it is a Gaussian o
 stop growing once mu has reached a+, so the paper's preference loss has its optimum there.
 
 `gaussian` (default): log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate.
-With it that difference is linear in mu: the loss has no optimum inside the action box and pushes mu past a+ to
-a corner, unless the rejected term is scaled down (the released code's 0.5).
+With it that difference is linear in mu: the loss has no optimum inside the action box and pushes
+mu past a+ to a corner, unless the rejected term is scaled down (the released code's 0.5).
 
 Both are finite with finite gradients everywhere on the action box, its corners included, where the
 expert's clipped actions lie. Another b is the same as `beta` divided by it.
