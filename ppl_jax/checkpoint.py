@@ -29,7 +29,7 @@ _CHECKSUM = "checksum.json"
 def _orbax() -> Any:
     from orbax.checkpoint import v1  # slow to import
 
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # it prints a failure ten times over
     return v1
 
 
@@ -65,10 +65,20 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
     part = folder / f"{_PREFIX}{step}.part"
     for path in (final, part):
         shutil.rmtree(path, ignore_errors=True)
-    _orbax().save((part / "learner").absolute(), tree)
-    record = {"schema": SCHEMA, "step": step, "crc32": _checksum(tree)}
-    (part / _CHECKSUM).write_text(json.dumps(record))
-    part.rename(final)
+    try:
+        _orbax().save((part / "learner").absolute(), tree)
+        record = {"schema": SCHEMA, "step": step, "crc32": _checksum(tree)}
+        (part / _CHECKSUM).write_text(json.dumps(record))
+        part.rename(final)
+    except (OSError, ValueError) as error:  # Orbax tells of a full disk by a ValueError
+        shutil.rmtree(part, ignore_errors=True)
+        full = "No space left on device" in str(error)
+        reason = "no space left on device" if full else str(error).splitlines()[0]
+        kept = steps(folder)
+        raise OSError(
+            f"cannot write checkpoint {step} in {folder}: {reason}; "
+            + (f"checkpoint {kept[-1]} is whole, go on from it with --resume" if kept else "")
+        ) from error
     for old in steps(folder)[:-KEPT]:
         shutil.rmtree(folder / f"{_PREFIX}{old}", ignore_errors=True)
 

@@ -227,6 +227,27 @@ def test_an_unwritable_folder_is_one_line():
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(tmp_path):
+    small = tmp_path / "small"
+    small.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(small)], capture_output=True
+    )
+    if mounted.returncode:
+        pytest.skip("a small disk cannot be mounted here (needs root)")
+    try:
+        done = ppl("train", "driving", *TINY, "--out", small / "run", code=1)
+        errors = [line for line in done.stderr.splitlines() if not line.startswith("train ")]
+        assert len(errors) == 1
+        assert "no space left on device" in errors[0]
+        assert "go on from it with --resume" in errors[0]
+        assert checkpoint.steps(small / "run" / "checkpoints")
+        subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
+        ppl("train", "driving", *TINY, "--out", small / "run", "--resume")
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
 def test_help_is_quick():
     began = time.time()
     assert "train" in ppl("--help").stdout
