@@ -38,6 +38,10 @@ class Train:
     """Weight of the behaviour-cloning loss."""
     preference_weight: float | None = None
     """Weight of the preference loss."""
+    preference_bias: float | None = None
+    """Factor on the rejected action's likelihood: 1 in the paper, 0.5 by default."""
+    likelihood: Literal["gaussian", "laplace"] | None = None
+    """Which log pi the losses mean."""
     prediction_noise: float | None = None
     """epsilon: noise of norm epsilon |s| on predicted states."""
     expert_noise: float | None = None
