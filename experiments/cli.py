@@ -229,15 +229,10 @@ def _compare(command: Compare) -> None:
 def _export(command: Export) -> None:
     import shutil
 
-    from experiments.evaluate import policy_path, run_spec
-    from experiments.policy_file import load_policy
+    from experiments.evaluate import policy_path, read_policy, run_spec
 
     source = policy_path(command.run)
-    spec = run_spec(command.run)
-    try:
-        load_policy(source, spec.observation_size, spec.action_size)
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    read_policy(source, run_spec(command.run))
     shutil.copyfile(source, command.out)
     print(f"wrote {command.out}")
 

@@ -146,6 +146,14 @@ def make_world(name: str, options: dict[str, Any]) -> Env:
         raise UserError(str(error)) from error
 
 
+def read_policy(path: str | Path, spec: WorldSpec) -> SavedPolicy:
+    """Load a policy file for a world; a mistake becomes a `UserError`."""
+    try:
+        return load_policy(path, spec.observation_size, spec.action_size)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
 def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
     """Play a run's held-out scenarios, or those of a folder of recordings, once.
 
@@ -157,8 +165,4 @@ def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
     if scenarios is not None:
         options = {"held_out_scenarios": scenarios}
     env = make_world(name, options)
-    try:
-        policy = load_policy(source, env.spec.observation_size, env.spec.action_size)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    return evaluate_policy(env, policy, 0)
+    return evaluate_policy(env, read_policy(source, env.spec), 0)

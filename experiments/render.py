@@ -11,8 +11,7 @@ import numpy as np
 from envs.driving.env import Driving, DrivingState
 from envs.driving.scenario import take
 from envs.rendering import Paths, Scene, draw, save_frames
-from experiments.evaluate import make_world, policy_path, run_options
-from experiments.policy_file import load_policy
+from experiments.evaluate import make_world, policy_path, read_policy, run_options
 from experiments.runtime import UserError
 from ppl_jax.config import default
 from ppl_jax.experts import neural_expert
@@ -44,13 +43,7 @@ def render(run: str, number: int, out: Path, steps: int) -> None:
     if scripted:
         act = env.scripted_expert
     else:
-        try:
-            policy = load_policy(
-                policy_path(Path(run)), env.spec.observation_size, env.spec.action_size
-            )
-        except ValueError as error:
-            raise UserError(str(error)) from error
-        act = neural_expert(policy)
+        act = neural_expert(read_policy(policy_path(Path(run)), env.spec))
     save_frames(out, episode(env, act, number, steps))
 
 

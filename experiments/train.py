@@ -18,9 +18,10 @@ from experiments.evaluate import (
     evaluate_policy,
     make_world,
     read_evaluation,
+    read_policy,
     summarise_episodes,
 )
-from experiments.policy_file import load_policy, save_policy
+from experiments.policy_file import save_policy
 from experiments.progress import Progress
 from experiments.runtime import UserError, device, revision, versions
 from ppl_jax import checkpoint
@@ -131,11 +132,7 @@ def build(settings: RunSettings) -> tuple[Env, Expert]:
     env = make_world(settings.env, options)
     if settings.expert == "scripted":
         return env, env.scripted_expert
-    try:
-        policy = load_policy(settings.expert, env.spec.observation_size, env.spec.action_size)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    return env, neural_expert(policy)
+    return env, neural_expert(read_policy(settings.expert, env.spec))
 
 
 def saved_policy(env: Env, params: Any) -> SavedPolicy:

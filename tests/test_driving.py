@@ -8,8 +8,7 @@ import pytest
 from envs.driving import geometry, lidar, vehicle
 from envs.driving import navigation as nav
 from envs.driving.env import contacts, make_driving
-from envs.driving.maps import MapSettings, generate
-from envs.driving.roads import RoadNetwork
+from envs.driving.maps import MapSettings, _draw_blocks, generate
 from envs.driving.scenario import Capacity, pack, take
 from ppl_jax.evaluation import evaluate
 
@@ -194,8 +193,15 @@ def test_routes_are_connected_and_blocks_do_not_cross():
                 for a, b in zip(d.network.roads[here], d.network.roads[there], strict=False)
             ]
             assert max(gaps) < 0.01
-        # the middle of a route road lies on no other road but its own junction's
-        assert isinstance(d.network, RoadNetwork)
+
+        rng = np.random.default_rng([number, 2025])
+        blocks, _ = _draw_blocks(rng, MapSettings())
+        for i, later in enumerate(blocks):
+            lanes = [lane for road in later.network.roads.values() for lane in road]
+            middles = np.array([lane.position(lane.length / 2, 0.0) for lane in lanes])
+            for earlier in blocks[:i]:
+                for road in earlier.network.roads.values():
+                    assert not any(lane.contains(middles).any() for lane in road)
 
 
 def test_auto_reset_starts_somewhere_new(world):
