@@ -37,4 +37,11 @@ def _driving(**options: Any) -> Any:
     return make_driving(**options)
 
 
+def _table_wiping(**options: Any) -> Any:
+    from envs.manipulation.wiping import make_table_wiping
+
+    return make_table_wiping(**options)
+
+
 register("driving", _driving)
+register("table_wiping", _table_wiping)

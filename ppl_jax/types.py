@@ -40,6 +40,8 @@ class Outcome:
     Attributes:
         reward, cost, progress, speed: Scalars (see `StepInfo`).
         terminated, truncated, success, unsafe: Booleans.
+        broken: The physics gave a value that is not finite; the state is the one before, and the
+            episode ends here.
     """
 
     reward: jax.Array
@@ -50,6 +52,7 @@ class Outcome:
     unsafe: jax.Array
     progress: jax.Array
     speed: jax.Array
+    broken: jax.Array | bool = False
 
 
 @flax.struct.dataclass

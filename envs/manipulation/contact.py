@@ -1,0 +1,62 @@
+"""MuJoCo's soft contact with friction: the cost of one elliptic cone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+IMPEDANCE_RATIO = 20.0  # of the normal's regularisation to friction's: robosuite's impratio
+
+
+def impedance(depth: jax.Array, low: float, high: float, width: float) -> jax.Array:
+    """MuJoCo's impedance d at a depth, m: a smooth step from `low` at 0 to `high` at `width`."""
+    x = jnp.clip(depth / width, 0.0, 1.0)
+    y = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))
+    return low + (high - low) * y
+
+
+def cone(
+    residual: jax.Array, weight: jax.Array, friction: float
+) -> tuple[jax.Array, jax.Array]:
+    """Force and second derivative of the elliptic cone's cost.
+
+    With n = mu r_z, t = friction |r_xy|: no force where n >= mu t; 1/2 weight (20 r_xy^2 + r_z^2)
+    where mu n + t <= 0 (the point sticks); else 1/2 middle (n - mu t)^2 (it slides).
+
+    Args:
+        residual: [3, P] J a - aref, z the normal.
+        weight: [P] 1/R of the normal; 0 for points in the air.
+        friction: Coefficient.
+
+    Returns:
+        [3, P] force, and xx, xy, yy, xz, yz, zz of the second derivative, [6, P].
+    """
+    x, y, z = residual
+    mu = friction / IMPEDANCE_RATIO**0.5
+    slide = jnp.sqrt(x * x + y * y + 1e-12)
+    tx, ty = x / slide, y / slide
+    middle = weight / (mu * mu * (1 + mu * mu))
+    normal, tangent = mu * z, friction * slide
+    gap = normal - mu * tangent
+    stuck = mu * normal + tangent <= 0
+    sliding = (gap < 0) & ~stuck
+    fz = jnp.where(stuck, -weight * z, jnp.where(sliding, -middle * gap * mu, 0.0))
+    held = weight * IMPEDANCE_RATIO
+    pull = jnp.where(stuck, -held * slide, -friction * fz)
+    steep = middle * mu * mu
+    bent = -middle * gap * mu * friction / slide
+
+    def both(when_stuck: Any, when_sliding: Any) -> jax.Array:
+        return jnp.where(stuck, when_stuck, jnp.where(sliding, when_sliding, 0.0))
+
+    hessian = [
+        both(held, steep * friction**2 * tx * tx + bent * (1 - tx * tx)),
+        both(0.0, (steep * friction**2 - bent) * tx * ty),
+        both(held, steep * friction**2 * ty * ty + bent * (1 - ty * ty)),
+        both(0.0, -steep * friction * tx),
+        both(0.0, -steep * friction * ty),
+        both(weight, steep),
+    ]
+    return jnp.stack([pull * tx, pull * ty, fz]), jnp.stack(hessian)

@@ -1,0 +1,44 @@
+"""The dirt on the table: a random walk of markers (robosuite 1.4.1, `models/arenas/wipe_arena.py`)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+COUNT = 100
+SPACING = 0.005  # m
+TURN_CHANCE, TURN = 0.3, 0.5  # of a new heading per marker; its standard deviation, rad
+COVERAGE, LINE_WIDTH = 0.6, 0.04
+_TRIES = 64  # new headings drawn at the border before the walk stands still (never seen to run out)
+
+
+def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
+    """One dirty line, [COUNT, 2], relative to the table's centre, m.
+
+    The heading changes by N(0, 0.5) with probability 0.3 per marker, and again and again where the
+    next marker would lie outside the central 60% of the table less half a line's width.
+
+    Args:
+        key: Random key.
+        half: Half sizes of the table, m.
+    """
+    limit = jnp.array([COVERAGE * size - LINE_WIDTH / 2 for size in half])
+    key_place, key_heading, key_walk = jax.random.split(key, 3)
+    place = jax.random.uniform(key_place, (2,), minval=-limit, maxval=limit)
+    heading = jax.random.uniform(key_heading, minval=-jnp.pi, maxval=jnp.pi)
+
+    def ahead(place: jax.Array, heading: jax.Array) -> jax.Array:
+        return place + SPACING * jnp.stack([jnp.sin(heading), jnp.cos(heading)])
+
+    def step(carry, key):
+        place, heading = carry
+        key_chance, key_turn, key_border = jax.random.split(key, 3)
+        turned = heading + TURN * jax.random.normal(key_turn)
+        heading = jnp.where(jax.random.uniform(key_chance) < TURN_CHANCE, turned, heading)
+        turns = TURN * jnp.cumsum(jax.random.normal(key_border, (_TRIES,)))
+        headings = heading + jnp.concatenate([jnp.zeros(1), turns])
+        inside = jnp.all(jnp.abs(jax.vmap(ahead, (None, 0))(place, headings)) < limit, -1)
+        heading = headings[jnp.argmax(inside)]
+        return (ahead(place, heading), heading), place
+
+    return jax.lax.scan(step, (place, heading), jax.random.split(key_walk, COUNT))[1]
