@@ -43,5 +43,12 @@ def _table_wiping(**options: Any) -> Any:
     return make_table_wiping(**options)
 
 
+def _nut_assembly(**options: Any) -> Any:
+    from envs.manipulation.nut import make_nut_assembly
+
+    return make_nut_assembly(**options)
+
+
 register("driving", _driving)
+register("nut_assembly", _nut_assembly)
 register("table_wiping", _table_wiping)

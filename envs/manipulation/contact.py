@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 IMPEDANCE_RATIO = 20.0  # of the normal's regularisation to friction's: robosuite's impratio
 
@@ -18,7 +19,7 @@ def impedance(depth: jax.Array, low: float, high: float, width: float) -> jax.Ar
 
 
 def cone(
-    residual: jax.Array, weight: jax.Array, friction: float
+    residual: jax.Array, weight: jax.Array, friction: np.ndarray | float
 ) -> tuple[jax.Array, jax.Array]:
     """Force and second derivative of the elliptic cone's cost.
 
@@ -28,7 +29,7 @@ def cone(
     Args:
         residual: [3, P] J a - aref, z the normal.
         weight: [P] 1/R of the normal; 0 for points in the air.
-        friction: Coefficient.
+        friction: Coefficient, or [P] of them.
 
     Returns:
         [3, P] force, and xx, xy, yy, xz, yz, zz of the second derivative, [6, P].
