@@ -111,7 +111,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     A part's share is what a run costs more than the same run without that part. It is the start of
     a run that is timed, where the expert is in control most and pairs cost most.
     """
-    config, hparams = PRESETS["default"]()
+    config, hparams = PRESETS["default"]("driving")
     config = dataclasses.replace(config, total_steps=STEPS)
     blocks = STEPS // config.decision_interval
 
@@ -151,7 +151,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
 
 def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
     """FLOP/s of the update against a plain matrix product of its largest shape."""
-    config, hparams = PRESETS["default"]()
+    config, hparams = PRESETS["default"]("driving")
     algorithm = ALGORITHMS["ppl"](env.spec, config)
     state = algorithm.init(jax.random.key(0))
     ones = jax.tree.map(jnp.ones_like, state.human_buffer.added) * config.batch_size

@@ -19,7 +19,7 @@ class Train:
     """Train one policy: progress, then the evaluation table; a run folder."""
 
     env: Positional[str]
-    """World: driving."""
+    """World: driving, table_wiping or nut_assembly."""
     algorithm: str = "ppl"
     """Method: ppl, or bc_only (PPL without its preference loss)."""
     seed: int = 0
@@ -50,6 +50,12 @@ class Train:
     """Of Adam."""
     min_speed: float | None = None
     """Gate: predicted mean speed below which the expert takes over, m/s."""
+    gate: Literal["unsafe_or_slow", "low_return", "falls_short"] | None = None
+    """What makes the expert take over (default: the paper's rule for the world)."""
+    min_return: float | None = None
+    """Gate low_return: predicted return at or below which the expert takes over."""
+    min_share: float | None = None
+    """Gate falls_short: share of the expert's own predicted return."""
     batch_size: int | None = None
     """Samples per loss and update."""
     predictor: Literal["simulator", "kinematic"] | None = None
@@ -60,8 +66,8 @@ class Train:
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
     """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
-    evaluate_every: int = 1000
-    """Steps between evaluations and checkpoints."""
+    evaluate_every: int | None = None
+    """Steps between evaluations and checkpoints (default: a tenth of the run)."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
@@ -85,7 +91,7 @@ class Compare:
     """Train several methods with the same seeds; one table."""
 
     env: Positional[str]
-    """World: driving."""
+    """World: driving, table_wiping or nut_assembly."""
     algorithms: tuple[str, ...] = ("ppl", "bc_only")
     """Methods."""
     seeds: int = 5
@@ -157,7 +163,10 @@ def run_settings(command: Train):
     from experiments.train import RunSettings
     from ppl_jax.config import PRESETS
 
-    config, hparams = PRESETS[command.preset]()
+    try:
+        config, hparams = PRESETS[command.preset](command.env)
+    except ValueError as error:
+        raise UserError(str(error)) from error
     given = {
         name: value for name, value in dataclasses.asdict(command).items() if value is not None
     }
@@ -181,8 +190,15 @@ def run_settings(command: Train):
         expert=command.expert,
         scenarios=command.scenarios,
         held_out_scenarios=command.held_out_scenarios,
-        evaluate_every=command.evaluate_every,
+        evaluate_every=(
+            default_interval(final) if command.evaluate_every is None else command.evaluate_every
+        ),
     )
+
+
+def default_interval(config) -> int:
+    """A tenth of the run, whole decisions."""
+    return max(config.total_steps // 10 // config.decision_interval, 1) * config.decision_interval
 
 
 def _train(command: Train) -> None:

@@ -303,6 +303,7 @@ class _Runner:
             **scores,
             "training_episodes": int(learner.counters.episodes),
             "training_cost": float(learner.counters.cost),
+            "broken_episodes": int(learner.counters.broken),
             "diverged": bool(learner.diverged),
             "wall_s": round(wall_s, 1),
             "compile_s": round(self.compile_s, 1),

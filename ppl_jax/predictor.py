@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import Env, Trajectory, Transition
+from ppl_jax.types import Env, Expert, Trajectory, Transition
 
 Act = Callable[[jax.Array], jax.Array]
 """`act(observation [O]) -> action [A]`."""
@@ -27,6 +27,7 @@ def predict(
     horizon: int,
     observe: bool = False,
     act: Act | None = None,
+    expert: Expert | None = None,
 ) -> Trajectory:
     """Roll `horizon` steps from `state`.
 
@@ -42,10 +43,14 @@ def predict(
         horizon: H, static.
         observe: Also return the observation of every predicted state.
         act: Policy asked again at every predicted state (the released code's gate).
+        expert: Expert asked at every predicted state, the first included; `action` is ignored.
     """
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Trajectory]:
         state, action, alive = carry
+        if expert is not None:
+            key, key_expert = jax.random.split(key)
+            action = expert(key_expert, state, env.observe(state, params), params)
         after, outcome = transition(key, state, action, params)
         after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
         empty = jnp.zeros((0,), jnp.float32)

@@ -35,6 +35,7 @@ class Counters:
         takeovers: Times the expert took control.
         episodes, successes: Training episodes that ended, and with success.
         cost: Sum of step costs while training.
+        broken: Episodes that ended because the physics broke down.
     """
 
     steps: jax.Array
@@ -43,6 +44,7 @@ class Counters:
     episodes: jax.Array
     successes: jax.Array
     cost: jax.Array
+    broken: jax.Array
 
 
 @flax.struct.dataclass
@@ -122,7 +124,7 @@ def make_train(
             takeover=jnp.zeros((), bool),
             key=key,
             hparams=as_arrays(hparams),
-            counters=Counters(zero, zero, zero, zero, zero, jnp.zeros(())),
+            counters=Counters(zero, zero, zero, zero, zero, jnp.zeros(()), zero),
             diverged=jnp.zeros((), bool),
         )
 
@@ -149,7 +151,19 @@ def make_train(
             config.prediction_horizon,
             act=functools.partial(algorithm.act, learner.algorithm) if asked_again else None,
         )
-        return algorithm.decide(learner.algorithm, trajectory, learner.hparams)
+        experts = None
+        if algorithm.compares:
+            experts = predict(
+                env,
+                transition,
+                key_predict,
+                learner.env_state,
+                action,
+                params,
+                config.prediction_horizon,
+                expert=expert,
+            )
+        return algorithm.decide(learner.algorithm, trajectory, experts, learner.hparams)
 
     def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
         """The first predicted states, for the pairs; skipped while the novice is in control."""
@@ -236,6 +250,7 @@ def make_train(
             episodes=counters.episodes + done,
             successes=counters.successes + outcome.success,
             cost=counters.cost + outcome.cost,
+            broken=counters.broken + outcome.broken,
         )
         # a takeover ends with its episode; the next decision waits for the grid
         return dataclasses.replace(
@@ -286,4 +301,5 @@ def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
         "train/episodes": spent.episodes,
         "train/success_rate": spent.successes / jnp.maximum(spent.episodes, 1),
         "train/cost_per_step": spent.cost / steps,
+        "train/broken_episodes": spent.broken,
     }

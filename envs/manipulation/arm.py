@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.manipulation.model import ARMATURE, HAND, LINKS, Tool
 
@@ -37,22 +35,22 @@ class Frames(NamedTuple):
 
 
 def add(a: Vector, b: Vector) -> Vector:
-    """a + b."""
+    """A + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def scale(k: Scalar, a: Vector) -> Vector:
-    """k a."""
+    """K a."""
     return (k * a[0], k * a[1], k * a[2])
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """a . b."""
+    """A . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """a x b."""
+    """A x b."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -61,7 +59,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def combine(m: Matrix, v: Vector) -> Vector:
-    """m v; components of `v` that are plain zeros cost nothing."""
+    """M v; components of `v` that are plain zeros cost nothing."""
     total: Vector | None = None
     for column, k in zip(m, v, strict=True):
         if isinstance(k, float) and k == 0.0:
@@ -162,9 +160,7 @@ def mass_matrix(at: Frames, tool: Tool) -> list[list[Scalar]]:
             )
             off = add(
                 off,
-                tuple(
-                    k * n[a] * n[b] - m * c[a] * c[b] for a, b in ((1, 2), (0, 2), (0, 1))
-                ),
+                tuple(k * n[a] * n[b] - m * c[a] * c[b] for a, b in ((1, 2), (0, 2), (0, 1))),
             )
         linear, angular = motions[j]
         push = add(scale(mass, linear), cross(angular, moment))

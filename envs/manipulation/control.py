@@ -12,7 +12,6 @@ from envs.manipulation.arm import (
     Matrix,
     Vector,
     add,
-    bias_torque,
     combine,
     cross,
     dot,
@@ -67,9 +66,7 @@ def new_goal(
     columns = []
     for now, before in zip(rotation, held, strict=True):
         new = combine(turn, now)
-        columns.append(
-            tuple(jnp.where(turned, a, b) for a, b in zip(new, before, strict=True))
-        )
+        columns.append(tuple(jnp.where(turned, a, b) for a, b in zip(new, before, strict=True)))
     return goal, tuple(columns)
 
 
@@ -171,7 +168,9 @@ def free_motion(
     for now, wanted in zip(at.rotation, goal[1], strict=True):
         twisted = add(twisted, scale(0.5, cross(now, wanted)))
     wanted_force = [STIFFNESS * e - DAMPING_RATE * v for e, v in zip(error, linear, strict=True)]
-    wanted_torque = [STIFFNESS * e - DAMPING_RATE * v for e, v in zip(twisted, angular, strict=True)]
+    wanted_torque = [
+        STIFFNESS * e - DAMPING_RATE * v for e, v in zip(twisted, angular, strict=True)
+    ]
     inverse = [[small.inner(a, b) for b in halves] for a in halves[:3]]
     force = small.apply_inverse3([row[:3] for row in inverse], wanted_force)
     inverse = [[small.inner(a, b) for b in halves[3:]] for a in halves[3:]]

@@ -177,8 +177,15 @@ def hold(
     """
     origin, axes = hand_axes(motion)
     pads, slopes = pad_points(origin, axes, fingers, inner)
-    tips = jnp.stack([pads[:1] + pads[_ROWS : _ROWS + 1], pads[2 * _ROWS : 2 * _ROWS + 1]
-                      + pads[3 * _ROWS : 3 * _ROWS + 1]])[:, 0] / 2
+    tips = (
+        jnp.stack(
+            [
+                pads[:1] + pads[_ROWS : _ROWS + 1],
+                pads[2 * _ROWS : 2 * _ROWS + 1] + pads[3 * _ROWS : 3 * _ROWS + 1],
+            ]
+        )[:, 0]
+        / 2
+    )
     tip_slopes = jnp.stack([slopes[0], slopes[2 * _ROWS]])
     beads = ring.position + BEADS @ ring.rotation.T
     feet = ring.position + _FEET @ ring.rotation.T

@@ -16,8 +16,12 @@ RAMP = 0.01  # change of the command per physics step towards the sign of the ac
 COMMANDS = np.linspace(0.0, 0.8, 9)
 # joints at rest for these commands, nothing held, rad (measured in robosuite 1.4.1)
 KNUCKLE_REST = np.array([-0.0276, 0.0269, 0.0904, 0.1532, 0.2156, 0.2858, 0.3560, 0.4262, 0.5005])
-INNER_FINGER_REST = np.array([-0.276, -0.276, -0.272, -0.266, -0.263, -0.264, -0.260, -0.257, -0.238])
-INNER_KNUCKLE_REST = np.array([-0.2018, -0.1560, -0.1048, -0.0545, -0.003, 0.062, 0.127, 0.193, 0.2594])
+INNER_FINGER_REST = np.array(
+    [-0.276, -0.276, -0.272, -0.266, -0.263, -0.264, -0.260, -0.257, -0.238]
+)
+INNER_KNUCKLE_REST = np.array(
+    [-0.2018, -0.1560, -0.1048, -0.0545, -0.003, 0.062, 0.127, 0.193, 0.2594]
+)
 INITIAL = np.array([-0.026, -0.267, -0.2] * 2)  # rad, after a reset
 
 STIFFNESS = 28.0  # N m/rad, knuckle towards its rest

@@ -75,12 +75,12 @@ def solve(factor: Rows, right: list[Scalar]) -> list[Scalar]:
 
 
 def times(matrix: Rows, vector: list[Scalar]) -> list[Scalar]:
-    """matrix vector."""
+    """Matrix vector."""
     return [inner(row, vector) for row in matrix]
 
 
 def inner(a: list[Scalar], b: list[Scalar]) -> Scalar:
-    """a . b."""
+    """A . b."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         total = total + x * y

@@ -196,7 +196,7 @@ def reward_of(
     contact: jax.Array,
     count: jax.Array,
 ) -> jax.Array:
-    """robosuite's shaped reward of a step without collision, before scaling.
+    """Robosuite's shaped reward of a step without collision, before scaling.
 
         50 per marker + 5 (1 - tanh 5 |centroid - eef|) [while any is left] + 25.5 [when none is]
         + 0.01 in contact - 0.05 F where F > 60 N, else + 0.01 + 0.01 F (+ 0.1 where > 50 contacts)
@@ -228,8 +228,8 @@ MEAN = np.concatenate(
     [[0.5, 0.15, 0.15, 0.0, 0.9], [0.0, 0.0, 0.0], np.cos(INITIAL_JOINTS),
      np.sin(INITIAL_JOINTS), np.zeros(6), [0.15, 0.0, 0.9], [-1.0, 0.03, 0.0, 0.0], [0.5]]
 ).astype(np.float32)  # fmt: skip
-# distances to the dirt and the height over the table decide; the joints, which say the same again in
-# a nonlinear way, are kept quiet (chosen by cloning on scenarios 2000-2049)
+# distances to the dirt and the height over the table decide; the joints, which say the same again
+# in a nonlinear way, are kept quiet (chosen by cloning on scenarios 2000-2049)
 SCALE = np.concatenate(
     [[0.3, 0.1, 1.0, 1.0, 0.3], [0.1, 0.1, 0.01], np.full(12, 3.0), np.full(6, 3.0),
      [1.0, 1.0, 0.01], np.full(4, 0.3), [0.5]]
@@ -341,8 +341,9 @@ class TableWiping(Environment):
             success=success,
             unsafe=unsafe,
             progress=jnp.mean(wiped.astype(jnp.float32)),
-            speed=jnp.linalg.norm(jnp.stack(control.twist_of(
-                control.jacobian(at), list(speeds))[0])),
+            speed=jnp.linalg.norm(
+                jnp.stack(control.twist_of(control.jacobian(at), list(speeds))[0])
+            ),
             broken=broken,
         )
 

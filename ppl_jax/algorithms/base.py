@@ -25,22 +25,25 @@ class Algorithm(NamedTuple):
         init: `init(key) -> state`, a struct with buffers and a field `learned` that holds all
             that updates change.
         act: `act(state, observation [O]) -> action [A]`, deterministic.
-        decide: `decide(state, trajectory, hparams) -> bool`, whether the expert takes over for
-            the next block of steps.
+        decide: `decide(state, trajectory, experts, hparams) -> bool`, whether the expert takes
+            over for the next block of steps; `experts` is the expert's own predicted trajectory
+            where `compares` asks for it, else None.
         store: `store(state, interaction, hparams) -> state`.
         update: `update(state, key, hparams) -> (state, metrics)`, one per environment step.
         policy_params: `policy_params(state)`, what evaluation, saving and export use.
         uses_predictions: Whether `store` reads `interaction.predicted`.
+        compares: Whether `decide` reads the expert's own prediction.
     """
 
     name: str
     init: Callable[[jax.Array], PyTree]
     act: Callable[[PyTree, jax.Array], jax.Array]
-    decide: Callable[[PyTree, Trajectory, HParams], jax.Array]
+    decide: Callable[[PyTree, Trajectory, Trajectory | None, HParams], jax.Array]
     store: Callable[[PyTree, Interaction, HParams], PyTree]
     update: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]]
     policy_params: Callable[[PyTree], PyTree]
     uses_predictions: bool
+    compares: bool = False
 
 
 MakeAlgorithm = Callable[[WorldSpec, TrainConfig], Algorithm]

@@ -13,7 +13,7 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import RULES
+from ppl_jax.intervention import COMPARING, RULES
 from ppl_jax.losses import Metrics, bc_loss, cpo_loss
 from ppl_jax.networks import make_policy
 from ppl_jax.preference import preference_pairs
@@ -66,8 +66,10 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
     def act(state: PPLState, observation: jax.Array) -> jax.Array:
         return policy.apply(state.learned.params, observation)
 
-    def decide(state: PPLState, trajectory: Trajectory, hparams: HParams) -> jax.Array:
-        return rule(trajectory, hparams)
+    def decide(
+        state: PPLState, trajectory: Trajectory, experts: Trajectory | None, hparams: HParams
+    ) -> jax.Array:
+        return rule(trajectory, experts, hparams)
 
     def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
         human = buffers.add(
@@ -126,4 +128,7 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
     def policy_params(state: PPLState) -> Any:
         return state.learned.average
 
-    return Algorithm(name, init, act, decide, store, update, policy_params, with_preferences)
+    compares = config.gate in COMPARING
+    return Algorithm(
+        name, init, act, decide, store, update, policy_params, with_preferences, compares
+    )
