@@ -98,6 +98,12 @@ class Compare:
     """Seeds 0, 1, ..., each method the same."""
     total_steps: int | None = None
     """Environment steps of each run."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    gate: Literal["unsafe_or_slow", "low_return", "falls_short"] | None = None
+    """What makes the expert take over (default: the paper's rule for the world)."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
     scenarios: str | None = None
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None

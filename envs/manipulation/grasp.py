@@ -27,11 +27,14 @@ from envs.manipulation.model import (
     PEG_HALF,
     PEG_RADIUS,
     RING_BEAD,
+    RING_CENTRE,
+    RING_INERTIA,
+    RING_MASS,
     RING_RADIUS,
     TIMESTEP,
 )
 
-ITERATIONS = 4
+ITERATIONS = 3
 # of the pads on the handle: twice robosuite's, for the torsional friction and the further contact
 # points that its flat pads have there (with 1, one grasp in ten slips where the recorded holds)
 PAD_FRICTION, FRICTION = 2.0, 1.0
@@ -41,14 +44,11 @@ _TABLE = NUT_TABLE[2] - NUT_BASE[2]
 _PEG = np.array([PEG[0] - NUT_BASE[0], PEG[1] - NUT_BASE[1]], np.float32)
 _PEG_TOP = PEG[2] + PEG_HALF - NUT_BASE[2]
 
-RING_MASS = 0.0194067  # kg
-RING_CENTRE = 0.00991  # m from the ring's origin towards the handle
-RING_INERTIA = np.array([1.7213e-5, 2.72618e-5, 4.3181e-5])  # about its own axes
 RING_DAMPING = 0.0005
 
 _ANGLES = np.pi / 4 * np.arange(8) + np.pi / 8
 BEADS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], -1) * RING_RADIUS
-_FEET = np.concatenate(
+FEET = np.concatenate(
     [
         BEADS[::2] * [1.2, 1.2, 0] - [0, 0, 0.01],
         [[HANDLE[0] + HANDLE_HALF[0], side * HANDLE_HALF[1], -0.01] for side in (-1, 1)],
@@ -188,7 +188,7 @@ def hold(
     )
     tip_slopes = jnp.stack([slopes[0], slopes[2 * _ROWS]])
     beads = ring.position + BEADS @ ring.rotation.T
-    feet = ring.position + _FEET @ ring.rotation.T
+    feet = ring.position + FEET @ ring.rotation.T
     groups = (on_handle(pads, ring), _upward(tips), _upward(feet), _around_peg(beads))
     gap, place, normal, tangent = (jnp.concatenate(parts) for parts in zip(*groups, strict=True))
     frame = jnp.stack([tangent, jnp.cross(normal, tangent), normal])  # [3, C, 3]
@@ -203,17 +203,17 @@ def hold(
     left = np.concatenate([np.ones(2 * _ROWS), np.zeros(2 * _ROWS), [1, 0]])
     by_finger = jnp.sum(frame[:, :carried] * jnp.concatenate([slopes, tip_slopes]), -1)
     by_finger = jnp.stack([by_finger * left, by_finger * (1 - left)], -1)  # [3, F, 2]
-    sign = np.concatenate([-np.ones(_PADS), np.zeros(2), np.ones(len(_FEET) + len(BEADS))])
+    sign = np.concatenate([-np.ones(_PADS), np.zeros(2), np.ones(len(FEET) + len(BEADS))])
     arms = place - ring.position
     by_ring = jnp.concatenate([frame, jnp.cross(arms[None], frame)], -1) * sign[None, :, None]
-    none = np.zeros((3, len(_FEET) + len(BEADS), 8), np.float32)
+    none = np.zeros((3, len(FEET) + len(BEADS), 8), np.float32)
     mover = jnp.concatenate([jnp.concatenate([by_arm, by_finger], -1), none], 1)
     rows = jax.lax.optimization_barrier(jnp.concatenate([mover, by_ring], -1))  # [3, C, 14]
 
     mass, free = _inertia(motion, ring, fingers, finger_speeds, control)
     speed = jnp.concatenate([jnp.stack(motion.speeds), finger_speeds, ring.velocity, ring.spin])
     inverse = np.concatenate(
-        [np.full(_PADS, 57.2), np.full(2, 5.7), np.full(len(_FEET) + len(BEADS), 51.5)]
+        [np.full(_PADS, 57.2), np.full(2, 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
     )
     weight = jnp.where(gap < 0, _IMPEDANCE / ((1 - _IMPEDANCE) * inverse), 0.0)
     depth = jnp.maximum(-gap, 0.0)
@@ -232,7 +232,12 @@ def hold(
                 h[3][:, None] * rows[0] + h[4][:, None] * rows[1] + h[5][:, None] * rows[2],
             ]
         )
-        matrix = mass + flat.T @ bent.reshape(-1, 14)
+        # the ring's own contacts do not touch the first eight columns
+        near, bent_near = rows[:, :carried, :8].reshape(-1, 8), bent[:, :carried].reshape(-1, 14)
+        by_mover = near.T @ bent_near
+        by_ring = rows[:, :, 8:].reshape(-1, 6).T @ bent[:, :, 8:].reshape(-1, 6)
+        lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
+        matrix = mass + jnp.concatenate([by_mover, lower])
         residual = flat.T @ force.reshape(-1) - mass @ (a - free)
         factor = small.settle(
             small.cholesky([[matrix[i, j] for j in range(14)] for i in range(14)])
@@ -243,12 +248,15 @@ def hold(
         off = a - free
         return 0.5 * off @ mass @ off + _cone_cost(rows @ a + rest, weight, friction)
 
-    a = jnp.where(cost(start) < cost(free), start, free)
-    for _ in range(ITERATIONS):
+    def iterate(_: jax.Array, a: jax.Array) -> jax.Array:
         new = improve(a)
         # Newton's step may overshoot where a contact comes or goes: half of it is tried as well
         half = 0.5 * (a + new)
-        a = jax.lax.optimization_barrier(jnp.where(cost(half) < cost(new), half, new))
+        return jnp.where(cost(half) < cost(new), half, new)
+
+    # a loop, not four copies: the compiler's time is most of what a newcomer waits for
+    a = jnp.where(cost(start) < cost(free), start, free)
+    a = jax.lax.fori_loop(0, ITERATIONS, iterate, a)
     force, _ = cone(rows @ a + rest, weight, friction)
     squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
     touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)

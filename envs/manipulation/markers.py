@@ -1,4 +1,4 @@
-"""The dirt on the table: a random walk of markers (robosuite 1.4.1, `models/arenas/wipe_arena.py`)."""
+"""The dirt on the table, a random walk (robosuite 1.4.1, `models/arenas/wipe_arena.py`)."""
 
 from __future__ import annotations
 

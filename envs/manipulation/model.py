@@ -33,6 +33,9 @@ PEG_RADIUS, PEG_HALF = 0.02, 0.1
 RING_RADIUS, RING_BEAD = 0.0412, 0.01  # of the circle of beads that stand for the ring; a bead's
 HANDLE = (0.06, 0.0, 0.0)  # of the handle's centre in the ring's frame
 HANDLE_HALF = (0.02525, 0.015875, 0.01)
+RING_MASS = 0.0194067  # kg
+RING_CENTRE = 0.00991  # m from the ring's origin towards the handle
+RING_INERTIA = np.array([1.7213e-5, 2.72618e-5, 4.3181e-5])  # about its own axes, kg m^2
 
 
 class Link(NamedTuple):
@@ -124,8 +127,8 @@ def _text(values: Iterable[float]) -> str:
 
 def _arm(tool: str, mount: tuple[float, float, float]) -> str:
     """The arm's bodies, nested, with `tool` (MJCF) in the hand."""
-    text = f"""
-<body name="hand" pos="{_text(HAND)}" quat=".7071067811865476 -.7071067811865476 0 0">{tool}</body>"""
+    quat = ".7071067811865476 -.7071067811865476 0 0"
+    text = f"""<body name="hand" pos="{_text(HAND)}" quat="{quat}">{tool}</body>"""
     for index, link in reversed(list(enumerate(LINKS))):
         quat = ".7071067811865476 0 .7071067811865476 0" if link.turned else "1 0 0 0"
         text = f"""
@@ -150,9 +153,9 @@ def _scene(bodies: str, pairs: str, extra: str = "") -> str:
     return f"""
 <mujoco model="ppl_jax">
   <compiler angle="radian" autolimits="true" inertiafromgeom="auto"/>
-  <option timestep="{TIMESTEP}" integrator="Euler" cone="pyramidal" solver="Newton"
-    gravity="0 0 -9.81" density="1.2" viscosity="2e-5" iterations="4" ls_iterations="4">
-    <flag eulerdamp="disable" filterparent="disable"/>
+  <option timestep="{TIMESTEP}" integrator="Euler" cone="elliptic" impratio="20" solver="Newton"
+    gravity="0 0 -9.81" density="{AIR_DENSITY}" viscosity="{AIR_VISCOSITY}" iterations="50">
+    <flag eulerdamp="disable"/>
   </option>
   <visual><headlight ambient=".45 .45 .45" diffuse=".55 .55 .55" specular=".1 .1 .1"/>
     <global offwidth="1280" offheight="960"/></visual>
@@ -188,3 +191,120 @@ def _table(table: tuple[tuple[float, float], tuple[float, float], float]) -> str
 <geom class="shown" type="box" pos="{x} {y} {top - 0.025}" size="{half_x} {half_y} .025"
   material="table"/>{legs}
 <geom name="table" class="felt" type="plane" pos="{x} {y} {top}" size="{half_x} {half_y} .05"/>"""
+
+
+def _inertial(tool: Tool) -> str:
+    return (
+        f'<inertial mass="{tool.mass}" pos="0 0 {tool.centre}" diaginertia="{_text(tool.inertia)}"/>'
+        f'<site name="grip" pos="0 0 {tool.grip}" quat=".7071067811865476 0 0 -.7071067811865476" '
+        'size=".004" rgba="0 0 0 0"/>'
+    )
+
+
+def _pair(name: str, first: str, second: str, friction: float, soft: str) -> str:
+    return (
+        f'<pair name="{name}" geom1="{first}" geom2="{second}" condim="3" '
+        f'friction="{friction} {friction} 0 0 0" {soft}/>'
+    )
+
+
+def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -> str:
+    """MJCF of table wiping.
+
+    Args:
+        points: [P, 2] contact points of the wiper's face, in the grip site's frame, m.
+        soft: solref and solimp of a point, as MJCF attributes.
+        friction: Of the wiper on the table.
+        markers: Number of spots of dirt (mocap bodies `marker_0` ...; drawn only).
+    """
+    radius = 0.001
+    spheres = "".join(
+        # the site's x is the hand's -y, its y the hand's x
+        f'<geom name="point_{i}" class="felt" type="sphere" size="{radius}" '
+        f'pos="{y:.6g} {-x:.6g} {WIPER.grip - radius}"/>'
+        for i, (x, y) in enumerate(points)
+    )
+    tool = f"""{_inertial(WIPER)}{spheres}
+<geom class="shown" type="box" pos="0 0 .004" size=".03 .03 .012" rgba="{_STEEL}"/>
+<geom class="shown" type="box" pos="0 0 .0225" size=".03 .06 .0075" rgba=".95 .75 .25 1"/>"""
+    pairs = "".join(
+        _pair(f"press_{i}", "table", f"point_{i}", friction, soft) for i in range(len(points))
+    )
+    spots = "".join(
+        f'<body name="marker_{i}" mocap="true"><geom class="shown" type="cylinder" '
+        'size=".02 .0006" rgba=".35 .22 .12 1"/></body>'
+        for i in range(markers)
+    )
+    return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
+
+
+def nut_scene(
+    beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, frictions: tuple[float, float]
+) -> str:
+    """MJCF of nut assembly.
+
+    The inner fingers are fixed to the knuckles here; `twin.py` turns them, and moves the pads'
+    points, as the gripper's state says.
+
+    Args:
+        beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
+        pads: Number of contact points on each pad.
+        soft: solref and solimp, as MJCF attributes.
+        frictions: Of the pads on the handle, and of everything else.
+    """
+    sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
+    fingers = ""
+    for side, sign in (("left", -1), ("right", 1)):
+        points = "".join(
+            f'<body name="{side}_pad_{i}">{sphere.format(f"{side}_{i}", 0.001, "0 0 0")}</body>'
+            for i in range(pads)
+        )
+        quat = "1 0 0 0" if sign > 0 else "0 0 0 1"
+        fingers += f"""
+<body name="{side}_knuckle" pos="0 {sign * 0.0306011} .054904" quat="{quat}">
+  <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>
+  <joint name="{side}_knuckle" axis="1 0 0"/>
+  <geom class="shown" type="capsule" fromto="0 0 0 0 .0376 .043" size=".009" rgba="{_STEEL}"/>
+  <body name="{side}_finger" pos="0 .0376 .043">
+    <geom class="shown" type="capsule" fromto="0 0 0 0 -.018 .022" size=".008" rgba="{_STEEL}"/>
+    <geom class="shown" type="box" pos="0 -.0220203 .03242" size=".011 .003175 .01875"
+      rgba=".15 .15 .17 1"/>
+  </body>
+  {points}
+</body>"""
+    tool = f"""{_inertial(GRIPPER)}
+<geom class="shown" type="box" pos="0 0 .045" size=".03 .038 .042" rgba="{_STEEL}"/>{fingers}"""
+    plates = "".join(
+        f'<geom class="shown" type="box" size=".01125 .0225 .01" rgba=".95 .60 .15 1" '
+        f'pos="{0.04245 * np.cos(a):.6g} {0.04245 * np.sin(a):.6g} 0" euler="0 0 {a:.6g}"/>'
+        for a in np.pi / 4 * np.arange(8)
+    )
+    spheres = "".join(
+        sphere.format(f"bead_{i}", RING_BEAD, _text(place)) for i, place in enumerate(beads)
+    ) + "".join(
+        sphere.format(f"foot_{i}", 0.001, _text(place + [0, 0, 0.001]))
+        for i, place in enumerate(feet)
+    )
+    ring = f"""
+<body name="ring" pos="-.1125 -.16 .89"><freejoint name="ring"/>
+  <inertial mass="{RING_MASS}" pos="{RING_CENTRE} 0 0" diaginertia="{_text(RING_INERTIA)}"/>
+  {plates}{spheres}
+  <geom name="handle" class="shown" type="box" pos="{_text(HANDLE)}" size="{_text(HANDLE_HALF)}"
+    rgba=".95 .60 .15 1"/>
+</body>"""
+    pegs = f"""
+<geom name="peg" class="shown" type="cylinder" pos="{_text(PEG)}" size="{PEG_RADIUS} {PEG_HALF}"
+  rgba=".25 .65 .35 1"/>
+<geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
+  rgba=".6 .62 .65 1"/>"""
+    grip, other = frictions
+    pairs = "".join(
+        _pair(f"{side}_{i}", f"{side}_{i}", "handle", grip, soft)
+        for side in ("left", "right")
+        for i in range(pads)
+    )
+    pairs += "".join(
+        _pair(f"foot_{i}", "table", f"foot_{i}", other, soft) for i in range(len(feet))
+    )
+    pairs += "".join(_pair(f"bead_{i}", f"bead_{i}", "peg", other, soft) for i in range(len(beads)))
+    return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)

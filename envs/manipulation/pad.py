@@ -104,7 +104,7 @@ def _fields(motion: Motion) -> jax.Array:
     return jnp.stack([entries[j][k] for k in range(9) for j in range(6)]).reshape(9, 6)
 
 
-# where entry (axis a of moment i, axis b of moment j) of the 9 x 9 form lies in [6 entries, 6 moments]
+# where entry (axis a of moment i, axis b of moment j) of the 9 x 9 form lies in the [6, 6] sums
 _ENTRY = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 _MOMENT = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _PLACE = (_ENTRY[None, :, None, :] * 6 + _MOMENT[:, None, :, None]).reshape(81)

@@ -147,7 +147,7 @@ def under_face(at: Frames, markers: jax.Array) -> jax.Array:
 
 
 def remaining(markers: jax.Array, wiped: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Share wiped, and of what is left the largest distance from the centroid and the centroid [3]."""
+    """Share wiped; of what is left, the radius about its centroid, and the centroid [3]."""
     left = ~wiped
     count = jnp.maximum(jnp.sum(left), 1)
     centroid = jnp.sum(jnp.where(left[:, None], markers, 0.0), 0) / count
