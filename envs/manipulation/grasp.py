@@ -38,7 +38,8 @@ ITERATIONS = 3
 # of the pads on the handle: twice robosuite's, for the torsional friction and the further contact
 # points that its flat pads have there (with 1, one grasp in ten slips where the recorded holds)
 PAD_FRICTION, FRICTION = 2.0, 1.0
-_STIFF, _DAMP, _IMPEDANCE = 1 / (0.974 * 0.02) ** 2, 2 / (0.974 * 0.02), 0.96
+# of every contact: MuJoCo's solref 0.02 1 at an impedance between ring's and others'
+STIFF, DAMP, IMPEDANCE = 1 / (0.974 * 0.02) ** 2, 2 / (0.974 * 0.02), 0.96
 _DEEPEST = 0.005  # m: a point farther inside the handle came through another face
 _TABLE = NUT_TABLE[2] - NUT_BASE[2]
 _PEG = np.array([PEG[0] - NUT_BASE[0], PEG[1] - NUT_BASE[1]], np.float32)
@@ -215,10 +216,10 @@ def hold(
     inverse = np.concatenate(
         [np.full(_PADS, 57.2), np.full(2, 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
     )
-    weight = jnp.where(gap < 0, _IMPEDANCE / ((1 - _IMPEDANCE) * inverse), 0.0)
+    weight = jnp.where(gap < 0, IMPEDANCE / ((1 - IMPEDANCE) * inverse), 0.0)
     depth = jnp.maximum(-gap, 0.0)
-    rest = _DAMP * (rows @ speed)
-    rest = rest.at[2].add(-_STIFF * _IMPEDANCE * depth)
+    rest = DAMP * (rows @ speed)
+    rest = rest.at[2].add(-STIFF * IMPEDANCE * depth)
     flat = rows.reshape(-1, 14)
     friction = np.where(np.arange(gap.shape[0]) < _PADS, PAD_FRICTION, FRICTION)
     friction = friction.astype(np.float32)

@@ -16,7 +16,7 @@ RAMP = 0.01  # change of the command per physics step towards the sign of the ac
 COMMANDS = np.linspace(0.0, 0.8, 9)
 # joints at rest for these commands, nothing held, rad (measured in robosuite 1.4.1)
 KNUCKLE_REST = np.array([-0.0276, 0.0269, 0.0904, 0.1532, 0.2156, 0.2858, 0.3560, 0.4262, 0.5005])
-INNER_FINGER_REST = np.array(
+INNERFINGER_REST = np.array(
     [-0.276, -0.276, -0.272, -0.266, -0.263, -0.264, -0.260, -0.257, -0.238]
 )
 INNER_KNUCKLE_REST = np.array(
@@ -33,9 +33,9 @@ FOLLOW = 0.05  # s, of the four following joints
 
 # a finger in the hand's frame: knuckle, inner finger, tip; m
 _KNUCKLE = (0.0306011, 0.054904)
-_FINGER = (0.0376, 0.043)
-_TIP = 0.03242
-_FACE = -0.0253  # of the pad, towards the other finger
+FINGER = (0.0376, 0.043)
+TIP = 0.03242
+FACE = -0.0253  # of the pad, towards the other finger
 PAD_HALF = 0.011  # along the hand's x
 PAD_ROWS = np.array([0.01875, 0.006, -0.007])  # along the pad, from its centre to the tip
 
@@ -61,7 +61,7 @@ def following_rest(knuckle: jax.Array, squeeze: jax.Array) -> tuple[jax.Array, j
     )
     share = jnp.clip(squeeze / FULL_SQUEEZE, 0.0, 1.0)
     return (
-        _look_up(INNER_FINGER_REST, control) + YIELD * share,
+        _look_up(INNERFINGER_REST, control) + YIELD * share,
         _look_up(INNER_KNUCKLE_REST, control) + RISE * share,
     )
 
@@ -73,10 +73,10 @@ def pad_rows(knuckle: jax.Array, inner: jax.Array) -> tuple[jax.Array, jax.Array
     finger mirrors y.
     """
     turn = knuckle + inner
-    along = _TIP + PAD_ROWS
+    along = TIP + PAD_ROWS
     sine, cosine = jnp.sin(knuckle), jnp.cos(knuckle)
     tilt, level = jnp.sin(turn), jnp.cos(turn)
-    out_y = _FINGER[0] * cosine - _FINGER[1] * sine + _FACE * level - along * tilt
-    out_z = _FINGER[0] * sine + _FINGER[1] * cosine + _FACE * tilt + along * level
+    out_y = FINGER[0] * cosine - FINGER[1] * sine + FACE * level - along * tilt
+    out_z = FINGER[0] * sine + FINGER[1] * cosine + FACE * tilt + along * level
     place = jnp.stack([_KNUCKLE[0] + out_y, _KNUCKLE[1] + out_z], -1)
     return place, jnp.stack([-out_z, out_y], -1)

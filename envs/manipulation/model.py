@@ -282,7 +282,7 @@ def nut_scene(
     spheres = "".join(
         sphere.format(f"bead_{i}", RING_BEAD, _text(place)) for i, place in enumerate(beads)
     ) + "".join(
-        sphere.format(f"foot_{i}", 0.001, _text(place + [0, 0, 0.001]))
+        sphere.format(f"foot_{i}", 0.001, _text(np.add(place, [0, 0, 0.001])))
         for i, place in enumerate(feet)
     )
     ring = f"""
@@ -302,6 +302,11 @@ def nut_scene(
         _pair(f"{side}_{i}", f"{side}_{i}", "handle", grip, soft)
         for side in ("left", "right")
         for i in range(pads)
+    )
+    pairs += "".join(
+        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", other, soft)
+        for side in ("left", "right")
+        for i in (0, pads // 2)
     )
     pairs += "".join(
         _pair(f"foot_{i}", "table", f"foot_{i}", other, soft) for i in range(len(feet))

@@ -270,7 +270,12 @@ class NutAssembly(Environment):
     ) -> tuple[NutState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key  # the world is deterministic
-        moved = advance(state, action)
+        return self.finish(state, advance(state, action), params)
+
+    def finish(
+        self, state: NutState, moved: NutState, params: NutParams
+    ) -> tuple[NutState, Outcome]:
+        """What a control step means, given its physics (see `advance`)."""
         values = [leaf for leaf in jax.tree.leaves(moved) if leaf.dtype == jnp.float32]
         broken = ~jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in values])))
         new = jax.tree.map(lambda a, b: jnp.where(broken, b, a), moved, state)

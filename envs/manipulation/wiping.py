@@ -287,7 +287,19 @@ class TableWiping(Environment):
     ) -> tuple[WipingState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key  # the world is deterministic
-        joints, speeds, acceleration, goal_rotation, push = advance(state, action)
+        return self.finish(state, *advance(state, action), params)
+
+    def finish(
+        self,
+        state: WipingState,
+        joints: jax.Array,
+        speeds: jax.Array,
+        acceleration: jax.Array,
+        goal_rotation: jax.Array,
+        push: jax.Array,
+        params: WipingParams,
+    ) -> tuple[WipingState, Outcome]:
+        """What a control step means, given its physics (see `advance`)."""
         broken = ~jnp.all(jnp.isfinite(jnp.concatenate([joints, speeds, acceleration, push])))
 
         def sound(new: jax.Array, old: jax.Array) -> jax.Array:
