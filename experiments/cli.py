@@ -136,6 +136,8 @@ class Render:
     """File to write."""
     steps: int = 600
     """At most so many steps."""
+    env: str = "driving"
+    """World of "scripted": driving, table_wiping or nut_assembly."""
 
 
 @dataclasses.dataclass
@@ -264,7 +266,7 @@ def _render(command: Render) -> None:
     from experiments.runtime import start_jax
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps)
+    render(command.run, command.scenario, command.out, command.steps, command.env)
     print(f"wrote {command.out}")
 
 

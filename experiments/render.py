@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.driving.env import Driving, DrivingState
 from envs.driving.scenario import take
 from envs.rendering import Paths, Scene, draw, save_frames
 from experiments.evaluate import make_world, policy_path, read_policy, run_options
 from experiments.runtime import UserError
 from ppl_jax.config import default
 from ppl_jax.experts import neural_expert
-from ppl_jax.intervention import unsafe_or_slow
+from ppl_jax.intervention import RULES
 from ppl_jax.predictor import predict
+from ppl_jax.types import Env, Expert
 
 SUFFIXES = (".gif", ".mp4", ".png")
 
+Draw = Callable[[Any, np.ndarray, bool, np.ndarray, str], np.ndarray]
+"""`draw(state, novice's path, takeover, expert's path, caption) -> picture`."""
 
-def render(run: str, number: int, out: Path, steps: int) -> None:
+
+def render(run: str, number: int, out: Path, steps: int, world: str = "driving") -> None:
     """Play a held-out scenario and write the film.
 
     Args:
@@ -29,6 +34,7 @@ def render(run: str, number: int, out: Path, steps: int) -> None:
         number: Of the scenario.
         out: .gif, .mp4 or .png (the last picture).
         steps: At most so many.
+        world: Where `run` is "scripted".
 
     Raises:
         UserError: If one of them cannot be used.
@@ -38,7 +44,7 @@ def render(run: str, number: int, out: Path, steps: int) -> None:
     if steps < 1:
         raise UserError(f"steps must be at least 1, got {steps}")
     scripted = run == "scripted"
-    name, options = ("driving", {}) if scripted else run_options(Path(run))
+    name, options = (world, {}) if scripted else run_options(Path(run))
     env = make_world(name, options)
     if scripted:
         act = env.scripted_expert
@@ -47,47 +53,76 @@ def render(run: str, number: int, out: Path, steps: int) -> None:
     save_frames(out, episode(env, act, number, steps))
 
 
-def episode(env: Driving, act, number: int, steps: int) -> list[np.ndarray]:
+def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     """Pictures of an episode, one per control step.
 
     Raises:
-        UserError: If the world has no scenario of that number.
+        UserError: If the world has no scenario of that number, or cannot be drawn here.
     """
     params = env.held_out_params
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
-    config, hparams = default()
-    horizon, key = config.prediction_horizon, jax.random.key(0)
+    config, hparams = default(env.name)
+    rule, key = RULES[config.gate], jax.random.key(0)
+    state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
+    if env.name == "driving":
+        place, picture = _driving(env, state)
+    else:
+        place, picture = _arm(env)
+    horizon = config.prediction_horizon
 
-    def positions(state: DrivingState, policy, held: bool) -> jax.Array:
+    def positions(state: Any, policy: Expert, held: bool) -> jax.Array:
         first = policy(key, state, env.observe(state, params), params)
 
-        def roll(state: DrivingState, _: None):
+        def roll(state: Any, _: None):
             action = first if held else policy(key, state, env.observe(state, params), params)
             state, _ = env.transition(key, state, action, params)
-            return state, state.ego.pose[:2]
+            return state, place(state)
 
         return jax.lax.scan(roll, state, None, length=horizon)[1]
 
     @jax.jit
-    def step(state: DrivingState):
+    def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
         trajectory = predict(env, env.transition, key, state, action, params, horizon)
         after, outcome = env.transition(key, state, action, params)
         novice = positions(state, act, held=True)
         expert = positions(state, env.scripted_expert, held=False)
-        return after, outcome, novice, unsafe_or_slow(trajectory, hparams), expert
+        return after, outcome, novice, rule(trajectory, None, hparams), expert
 
-    state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
-    scene = Scene(take(params.scenarios, state.scenario))
     frames = []
     for t in range(steps):
         after, outcome, novice, takeover, expert = step(state)
-        paths = Paths(np.asarray(novice), bool(takeover), np.asarray(expert))
-        caption = f"scenario {number}   {t / 10:.1f} s   {float(outcome.speed) * 3.6:.0f} km/h"
-        frames.append(draw(scene, state, paths, caption=caption))
+        caption = f"scenario {number}   step {t}   speed {float(outcome.speed):.2f} m/s"
+        frames.append(
+            picture(state, np.asarray(novice), bool(takeover), np.asarray(expert), caption)
+        )
         state = after
         if bool(outcome.terminated):
             break
     return frames
+
+
+def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    scene = Scene(take(env.held_out_params.scenarios, state.scenario))
+
+    def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
+        return draw(scene, state, Paths(novice, takeover, expert), caption=caption)
+
+    return (lambda state: state.ego.pose[:2]), picture
+
+
+def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    try:
+        from envs.manipulation.drawing import ArmPaths, ArmScene
+
+        scene = ArmScene(env)
+    except (ImportError, RuntimeError) as error:
+        raise UserError(str(error)) from error
+
+    def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
+        del caption
+        return scene.draw(state, ArmPaths(novice, takeover, expert))
+
+    return env.grip_position, picture

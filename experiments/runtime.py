@@ -9,6 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from envs.compiler import set_xla_flags
+
 CACHE_VARIABLE = "PPL_JAX_CACHE"
 _PACKAGES = ("ppl-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
@@ -24,23 +26,6 @@ def cache_folder() -> Path:
         return Path(named)
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "ppl_jax" / "xla"
-
-
-# A loop whose body touches less than so many bytes is compiled as one function instead of one
-# kernel per fusion (XLA's own limit is 1 kB): seven times faster for one robot arm, twice for a
-# predicted car. Large products must stay out: in such a loop they are plain C loops.
-_SMALL_LOOP = 2_000_000
-_XLA_FLAGS = {
-    "--xla_cpu_experimental_ynn_fusion_type": "",  # its kernels keep a loop from being one function
-    "--xla_backend_extra_options": f"xla_cpu_small_while_loop_byte_threshold={_SMALL_LOOP}",
-}
-
-
-def set_xla_flags() -> None:
-    """Compile small loops well on a CPU. Call before JAX is used; what a user set is kept."""
-    given = os.environ.get("XLA_FLAGS", "")
-    flags = [f"{name}={value}" for name, value in _XLA_FLAGS.items() if name not in given]
-    os.environ["XLA_FLAGS"] = " ".join([given, *flags]).strip()
 
 
 def start_jax() -> None:

@@ -1,11 +1,17 @@
 import os
 from pathlib import Path
 
-import jax
 import pytest
 
+from envs.compiler import set_xla_flags
+
+set_xla_flags()  # before JAX starts: tests run the programs that users run
+
+import jax  # noqa: E402
+
 CACHE = Path(__file__).parent.parent / ".pytest_cache" / "xla"
-RECORDINGS = Path(__file__).parent.parent.parent / "shared" / "data" / "metadrive"
+DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+RECORDINGS = DATA / "metadrive"
 
 
 def pytest_configure(config):
@@ -21,6 +27,15 @@ def recordings():
     if not RECORDINGS.is_dir():
         pytest.skip("the MetaDrive recordings (../shared/data/metadrive) are not here")
     return RECORDINGS
+
+
+@pytest.fixture(scope="session")
+def robosuite_recordings():
+    """Folder of recorded robosuite traces; tests that need it skip without it."""
+    folder = DATA / "robosuite"
+    if not folder.is_dir():
+        pytest.skip("the robosuite recordings (../shared/data/robosuite) are not here")
+    return folder
 
 
 @pytest.fixture(scope="session")

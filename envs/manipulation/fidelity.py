@@ -1,4 +1,4 @@
-"""How close these worlds are to recorded robosuite 1.4.1: `python -m envs.manipulation.fidelity DIR`.
+"""How close these worlds are to robosuite 1.4.1: `python -m envs.manipulation.fidelity DIR`.
 
 Prints one JSON object for a folder of recordings (`wipe_*`, `nut_*`, `free_wipe_*`, `free_nut_*`,
 `osc_steps`, `press`, `lookahead`, each `.npz`); a figure whose files are missing is null:
@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.compiler import set_xla_flags
 from envs.manipulation import nut, wiping
 from envs.manipulation.arm import frames
 from envs.manipulation.model import GRIPPER, NUT_BASE, WIPER, WIPING_BASE
@@ -115,14 +116,16 @@ _replay_many = jax.jit(
 
 def _windows(env: Any, states: list[Any], actions: list[np.ndarray]) -> Any:
     """Replay windows of one length, 32 at a time so that every folder shares a program."""
-    results = []
+    results, done = [], None
     for first in range(0, len(states), 32):
         some, acts = states[first : first + 32], actions[first : first + 32]
         missing = 32 - len(some)
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *some, *[some[-1]] * missing)
         done = _replay_many(env, stacked, jnp.float32([*acts, *[acts[-1]] * missing]))
-        results.append(jax.tree.map(lambda x, n=len(some): np.asarray(x)[:n], done))
-    return jax.tree.map(lambda *x: np.concatenate(x), *results)
+        kept = len(some)
+        results.append([np.asarray(x)[:kept] for x in jax.tree.leaves(done)])
+    leaves = [np.concatenate(parts) for parts in zip(*results, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(done), leaves)
 
 
 def _load(folder: Path, pattern: str) -> list[dict[str, np.ndarray]]:
@@ -305,6 +308,7 @@ def main() -> None:
     """Print the figures as JSON."""
     parser = argparse.ArgumentParser(prog="python -m envs.manipulation.fidelity")
     parser.add_argument("folder", help="folder of recordings")
+    set_xla_flags()
     try:
         print(json.dumps(fidelity(parser.parse_args().folder), indent=2))
     except ValueError as error:

@@ -195,7 +195,8 @@ def _table(table: tuple[tuple[float, float], tuple[float, float], float]) -> str
 
 def _inertial(tool: Tool) -> str:
     return (
-        f'<inertial mass="{tool.mass}" pos="0 0 {tool.centre}" diaginertia="{_text(tool.inertia)}"/>'
+        f'<inertial mass="{tool.mass}" pos="0 0 {tool.centre}" '
+        f'diaginertia="{_text(tool.inertia)}"/>'
         f'<site name="grip" pos="0 0 {tool.grip}" quat=".7071067811865476 0 0 -.7071067811865476" '
         'size=".004" rgba="0 0 0 0"/>'
     )

@@ -304,6 +304,10 @@ class NutAssembly(Environment):
             broken=broken,
         )
 
+    def grip_position(self, state: NutState) -> jax.Array:
+        """Where the grip site is, [3] m in the world."""
+        return jnp.stack(lagged_frames(state).position) + _BASE
+
     def observe(self, state: NutState, params: NutParams) -> jax.Array:
         """The 51 values, in robosuite 1.4.1's order.
 

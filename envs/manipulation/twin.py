@@ -113,21 +113,26 @@ class WipingTwin(wiping.TableWiping):
 
     def __init__(self, env: wiping.TableWiping):
         super().__init__(env.default_params, env.held_out_params)
-        self._arm = _Arm(wiping_xml())
+        self.arm = _Arm(wiping_xml())
         self._finish = jax.jit(self.finish)
+
+    def place(self, state: wiping.WipingState) -> None:
+        """Put MuJoCo's data into a state."""
+        data = self.arm.data
+        data.qpos[:6], data.qvel[:6] = np.asarray(state.joints), np.asarray(state.speeds)
+        data.qacc_warmstart[:] = np.asarray(state.acceleration)
+        data.mocap_pos[:, :2] = np.asarray(state.markers)
+        data.mocap_pos[:, 2] = np.where(state.wiped, -1.0, WIPING_TABLE[2])
 
     def transition(
         self, key: Any, state: wiping.WipingState, action: jax.Array, params: wiping.WipingParams
     ) -> tuple[wiping.WipingState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key
-        arm = self._arm
+        arm = self.arm
         model, data, mujoco = arm.model, arm.data, arm.mujoco
         action = np.clip(np.asarray(action, float), -1, 1)
-        data.qpos[:6], data.qvel[:6] = np.asarray(state.joints), np.asarray(state.speeds)
-        data.qacc_warmstart[:] = np.asarray(state.acceleration)
-        data.mocap_pos[:, :2] = np.asarray(state.markers)
-        data.mocap_pos[:, 2] = np.where(state.wiped, -1.0, WIPING_TABLE[2])
+        self.place(state)
         mujoco.mj_forward(model, data)
         goal = arm.goal(action, np.asarray(state.goal_rotation, float).T)
         for _ in range(SUBSTEPS):
@@ -149,7 +154,7 @@ class NutTwin(nut.NutAssembly):
 
     def __init__(self, env: nut.NutAssembly):
         super().__init__(env.default_params, env.held_out_params)
-        arm = self._arm = _Arm(nut_xml())
+        arm = self.arm = _Arm(nut_xml())
         model = arm.model
         self._finish = jax.jit(self.finish)
         # MuJoCo numbers joints by their place in the tree: arm, left, right, ring
@@ -163,9 +168,23 @@ class NutTwin(nut.NutAssembly):
         model.dof_armature[self._knuckles] = mass
         model.dof_damping[self._ring : self._ring + 6] = grasp.RING_DAMPING
 
+    def place(self, state: nut.NutState) -> None:
+        """Put MuJoCo's data into a state."""
+        data, dofs, ring, at = self.arm.data, self._knuckles, self._ring, self._ring_at
+        fingers = np.asarray(state.fingers, float)
+        turn = np.asarray(nut.rotation_matrix(state.quaternion), float)
+        data.qpos[:6], data.qvel[:6] = np.asarray(state.joints), np.asarray(state.speeds)
+        data.qpos[dofs] = fingers[::3]
+        data.qvel[dofs] = np.asarray(state.finger_speeds)[::3]
+        data.qpos[at : at + 3] = np.asarray(state.position)
+        data.qpos[at + 3 : at + 7] = np.asarray(state.quaternion)
+        data.qvel[ring : ring + 3] = np.asarray(state.velocity)
+        data.qvel[ring + 3 : ring + 6] = turn.T @ np.asarray(state.spin)
+        self._pose_fingers(fingers[1::3])
+
     def _pose_fingers(self, inner: np.ndarray) -> None:
         """Turn the inner fingers and put the pads' points where the gripper's geometry says."""
-        model = self._arm.model
+        model = self.arm.model
         for index, side in enumerate(("left", "right")):
             half = 0.5 * inner[index]
             model.body(f"{side}_finger").quat[:] = [np.cos(half), np.sin(half), 0, 0]
@@ -189,19 +208,13 @@ class NutTwin(nut.NutAssembly):
     ) -> tuple[nut.NutState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key
-        arm = self._arm
+        arm = self.arm
         model, data, mujoco = arm.model, arm.data, arm.mujoco
         action = np.clip(np.asarray(action, float), -1, 1)
         fingers = np.asarray(state.fingers, float).copy()
         speeds = np.asarray(state.finger_speeds, float).copy()
         dofs, ring, at = self._knuckles, self._ring, self._ring_at
-        turn = np.asarray(nut.rotation_matrix(state.quaternion), float)
-        data.qpos[:6], data.qvel[:6] = np.asarray(state.joints), np.asarray(state.speeds)
-        data.qpos[dofs], data.qvel[dofs] = fingers[::3], speeds[::3]
-        data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = state.position, state.quaternion
-        data.qvel[ring : ring + 3] = np.asarray(state.velocity)
-        data.qvel[ring + 3 : ring + 6] = turn.T @ np.asarray(state.spin)
-        self._pose_fingers(fingers[1::3])
+        self.place(state)
         mujoco.mj_forward(model, data)
         goal = arm.goal(action, np.asarray(state.goal_rotation, float).T)
         command, touching = float(state.command), False
@@ -249,7 +262,7 @@ class NutTwin(nut.NutAssembly):
 
     def _squeeze(self) -> tuple[np.ndarray, list[bool]]:
         """Normal force of each pad on the handle, N, and whether it touches."""
-        model, data, mujoco = self._arm.model, self._arm.data, self._arm.mujoco
+        model, data, mujoco = self.arm.model, self.arm.data, self.arm.mujoco
         total, sides = np.zeros(2), [False, False]
         for index in range(data.ncon):
             one = data.contact[index]

@@ -359,6 +359,10 @@ class TableWiping(Environment):
             broken=broken,
         )
 
+    def grip_position(self, state: WipingState) -> jax.Array:
+        """Where the grip site is, [3] m in the world."""
+        return jnp.stack(lagged_frames(state).position) + _BASE
+
     def observe(self, state: WipingState, params: WipingParams) -> jax.Array:
         """The 34 values, in robosuite 1.4.1's order.
 
