@@ -104,7 +104,7 @@ def test_arm_and_pressed_wiper_are_mjxs(mujoco):
     data.qpos[:], data.qvel[:], data.qfrc_applied[:] = record[0], record[1], torque
     put = mjx.put_model(model)
     seen = jax.jit(mjx.forward)(put, mjx.put_data(model, data))
-    _, _, columns, mass, bias = arm_values(record[0], record[1], WIPER)
+    _, _, _columns, mass, bias = arm_values(record[0], record[1], WIPER)
     np.testing.assert_allclose(mass, np.asarray(mjx.full_m(put, seen)), atol=1e-4)
     np.testing.assert_allclose(bias, np.asarray(seen.qfrc_bias), atol=1e-3)
     passive = np.asarray(seen.qfrc_passive)
@@ -185,8 +185,10 @@ def test_twin_grasps_alike(mujoco):
         action = act(ours)
         ours, _ = step(ours, action)
         theirs, _ = twin.transition(KEY, theirs, action, env.default_params)
-    assert bool(ours.touching) and bool(theirs.touching)
-    assert float(ours.position[2]) > 0.86 and float(theirs.position[2]) > 0.86
+    assert bool(ours.touching)
+    assert bool(theirs.touching)
+    assert float(ours.position[2]) > 0.86
+    assert float(theirs.position[2]) > 0.86
     np.testing.assert_allclose(ours.position, theirs.position, atol=0.01)
 
 
@@ -238,7 +240,8 @@ def test_broken_physics_ends_one_world_and_spreads_nowhere(name):
     )
     assert list(np.asarray(outcome.broken)) == [True, False]
     assert list(np.asarray(outcome.terminated)) == [True, False]
-    assert not bool(outcome.success[0]) and np.isfinite(np.asarray(outcome.reward)).all()
+    assert not bool(outcome.success[0])
+    assert np.isfinite(np.asarray(outcome.reward)).all()
     alone, _ = transition(name)(start(name, 1), actions[1])
     close(jax.tree.map(lambda x: x[1], after), alone, 1e-4)
 
@@ -320,12 +323,15 @@ def test_wiping_needs_pressure_and_the_face():
 def test_stages_of_the_nut():
     far, on_table = jnp.array([0.0, 0.0, 1.0]), jnp.array([-0.11, -0.15, 0.83])
     staged, on = nut.stages(far, on_table, on_table, jnp.array(False), jnp.int32(60))
-    assert not bool(on) and float(staged[1]) == 0
+    assert not bool(on)
+    assert float(staged[1]) == 0
     staged, _ = nut.stages(on_table, on_table, on_table, jnp.array(True), jnp.int32(60))
-    assert float(staged[0]) == pytest.approx(0.1) and float(staged[1]) == pytest.approx(0.35)
+    assert float(staged[0]) == pytest.approx(0.1)
+    assert float(staged[1]) == pytest.approx(0.35)
     lifted = jnp.array([0.23, -0.10, 0.995])
     staged, on = nut.stages(lifted, lifted, lifted, jnp.array(True), jnp.int32(60))
-    assert float(staged[3]) == pytest.approx(0.7) and not bool(on)
+    assert float(staged[3]) == pytest.approx(0.7)
+    assert not bool(on)
     assert bool(
         nut.stages(lifted, lifted.at[2].set(0.86), lifted, jnp.array(True), jnp.int32(1))[1]
     )
