@@ -15,7 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import make
 from envs.driving.env import make_driving
+from envs.manipulation.model import SUBSTEPS
 from experiments.runtime import device, versions
 from experiments.tables import print_table
 from ppl_jax.algorithms import ALGORITHMS
@@ -24,6 +26,7 @@ from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
 
 STEPS = 200  # environment steps per timed call
+CONTACT_STEPS = 60  # after which an arm's tool is in contact
 
 
 def _median_s(run: Callable[[], Any], repeats: int) -> float:
@@ -43,6 +46,8 @@ def bench(repeats: int, out: Path | None) -> dict[str, Any]:
     figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
     figures |= _environment(env, repeats) | _lookahead(env, repeats) | _training(env, repeats)
     figures |= _gradient(env, repeats, figures["train_ms_per_step"])
+    for name in ("table_wiping", "nut_assembly"):
+        figures |= _arm(name, repeats)
     unit = 1 if sys.platform == "darwin" else 1024
     figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
@@ -103,6 +108,66 @@ def _lookahead(env: Any, repeats: int) -> dict[str, float]:
         return jax.lax.scan(call, jnp.zeros(()), None, length=calls)[0]
 
     return {"predicted_steps_per_s": horizon * calls / _median_s(lambda: run(state), repeats)}
+
+
+def _arm(name: str, repeats: int) -> dict[str, float]:
+    """Control steps per second of an arm world, its lookahead, compile time, and C MuJoCo's rate.
+
+    The expert is at the controls until the tool is in contact; its last action is held from there.
+    """
+    env = make(name)
+    params, key, figures = env.default_params, jax.random.key(0), {}
+    steps = 40
+
+    def play(state: Any, action: jax.Array) -> Any:
+        def step(state: Any, _: None) -> Any:
+            return env.transition(key, state, action, params)[0], None
+
+        return jax.lax.scan(step, state, None, length=steps)[0]
+
+    def approach(state: Any) -> Any:
+        def step(state: Any, _: None) -> Any:
+            action = env.scripted_expert(key, state, env.observe(state, params), params)
+            return env.transition(key, state, action, params)[0], action
+
+        return jax.lax.scan(step, state, None, length=CONTACT_STEPS)
+
+    start = env.reset_to(jnp.int32(0), key, params)
+    state, actions = jax.jit(approach)(start)
+    for worlds in (1, 16, 64, 256):
+        many = jax.tree.map(lambda x, n=worlds: jnp.stack([x] * n), state)
+        began = time.perf_counter()
+        given = state if worlds == 1 else many
+        program = jax.jit(play if worlds == 1 else jax.vmap(play, in_axes=(0, None)))
+        compiled = program.lower(given, actions[-1]).compile()
+        figures[f"{name}_compile_s_{worlds}"] = time.perf_counter() - began
+        seconds = _median_s(lambda c=compiled, g=given: c(g, actions[-1]), repeats)
+        figures[f"{name}_steps_per_s_{worlds}"] = worlds * steps / seconds
+    ahead = jax.jit(
+        lambda state: predict(env, env.transition, key, state, actions[-1], params, 10).reward
+    )
+    figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
+    try:
+        from envs.manipulation.twin import make_twin
+
+        twin = make_twin(env)
+    except ImportError:
+        return figures
+    twin.place(state)
+    arm = twin.arm
+    hold = arm.goal(np.zeros(6), np.asarray(state.goal_rotation, float).T)
+
+    def c_mujoco() -> None:
+        for _ in range(SUBSTEPS * 10):
+            arm.mujoco.mj_step1(arm.model, arm.data)
+            arm.data.qfrc_applied[:6] = arm.torque(hold)
+            arm.mujoco.mj_step2(arm.model, arm.data)
+
+    figures[f"{name}_c_mujoco_steps_per_s"] = 10 / _median_s(c_mujoco, repeats)
+    figures[f"{name}_over_c_mujoco"] = (
+        figures[f"{name}_steps_per_s_1"] / figures[f"{name}_c_mujoco_steps_per_s"]
+    )
+    return figures
 
 
 def _training(env: Any, repeats: int) -> dict[str, float]:

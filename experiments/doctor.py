@@ -47,7 +47,7 @@ def doctor() -> None:
         ("PIL", "render", "pictures and GIFs"),
         ("av", "render", "MP4 films"),
         ("matplotlib", "plot", "figures"),
-        ("mujoco", "manipulation", "the UR5e worlds"),
+        ("mujoco", "manipulation", "pictures of the UR5e worlds, and their C MuJoCo twin"),
         ("brax", "brax", "the brax adapter"),
     ):
         if importlib.util.find_spec(module) is not None:

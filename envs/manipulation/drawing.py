@@ -83,7 +83,7 @@ def choose_backend() -> None:
 class ArmScene:
     """A world ready to be drawn again and again."""
 
-    def __init__(self, env: Any, size: tuple[int, int] = (360, 480)):
+    def __init__(self, env: Any, size: tuple[int, int] = (300, 400)):
         choose_backend()
         import mujoco
 

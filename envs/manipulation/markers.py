@@ -9,7 +9,6 @@ COUNT = 100
 SPACING = 0.005  # m
 TURN_CHANCE, TURN = 0.3, 0.5  # of a new heading per marker; its standard deviation, rad
 COVERAGE, LINE_WIDTH = 0.6, 0.04
-_TRIES = 64  # new headings drawn at the border before the walk stands still (never seen to run out)
 
 
 def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
@@ -35,10 +34,16 @@ def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
         key_chance, key_turn, key_border = jax.random.split(key, 3)
         turned = heading + TURN * jax.random.normal(key_turn)
         heading = jnp.where(jax.random.uniform(key_chance) < TURN_CHANCE, turned, heading)
-        turns = TURN * jnp.cumsum(jax.random.normal(key_border, (_TRIES,)))
-        headings = heading + jnp.concatenate([jnp.zeros(1), turns])
-        inside = jnp.all(jnp.abs(jax.vmap(ahead, (None, 0))(place, headings)) < limit, -1)
-        heading = headings[jnp.argmax(inside)]
+
+        def outside(carry) -> jax.Array:
+            return ~jnp.all(jnp.abs(ahead(place, carry[0])) < limit)
+
+        def turn(carry):
+            heading, key = carry
+            key, key_now = jax.random.split(key)
+            return heading + TURN * jax.random.normal(key_now), key
+
+        heading, _ = jax.lax.while_loop(outside, turn, (heading, key_border))
         return (ahead(place, heading), heading), place
 
     return jax.lax.scan(step, (place, heading), jax.random.split(key_walk, COUNT))[1]
