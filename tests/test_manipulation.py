@@ -177,7 +177,7 @@ def test_twin_grasps_alike(mujoco):
 
     env, twin = world("nut_assembly"), make_twin(world("nut_assembly"))
     act, step = expert_action("nut_assembly"), transition("nut_assembly")
-    ours = start("nut_assembly", 1)
+    ours = start("nut_assembly", 0)
     while not (bool(ours.touching) and float(ours.command) > 0.98):
         ours, _ = step(ours, act(ours))
     theirs = ours

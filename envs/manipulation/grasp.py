@@ -34,7 +34,7 @@ from envs.manipulation.model import (
     TIMESTEP,
 )
 
-ITERATIONS = 4
+ITERATIONS = 3
 # of the pads on the handle: twice robosuite's, for the torsional friction and the further contact
 # points that its flat pads have there (with 1, one grasp in ten slips where the recorded holds)
 PAD_FRICTION, FRICTION = 2.0, 1.0
