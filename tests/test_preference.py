@@ -90,7 +90,7 @@ def test_changing_the_horizon_compiles_nothing():
     ],
 )
 def test_the_driving_gate(case, expected):
-    assert bool(unsafe_or_slow(trajectory(**case), HParams(min_speed=5.0))) is expected
+    assert bool(unsafe_or_slow(trajectory(**case), None, HParams(min_speed=5.0))) is expected
 
 
 @pytest.mark.parametrize(
@@ -103,4 +103,4 @@ def test_the_driving_gate(case, expected):
     ],
 )
 def test_the_released_gate(case, expected):
-    assert bool(low_return(trajectory(**case), HParams(min_return=10.0))) is expected
+    assert bool(low_return(trajectory(**case), None, HParams(min_return=10.0))) is expected

@@ -69,7 +69,7 @@ def test_without_an_expert_in_reach_nothing_is_learnt():
     # a gate that never fires: no data, no update
     probe, fns = functions()
     algorithm = fns.algorithm._replace(
-        decide=lambda state, trajectory, hparams: jnp.zeros((), bool)
+        decide=lambda state, trajectory, experts, hparams: jnp.zeros((), bool)
     )
     fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
     start = fns.init(jax.random.key(0), HP)
