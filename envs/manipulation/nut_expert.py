@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from envs.manipulation.model import PEG
 from envs.manipulation.nut import (
     _BASE,
+    PLACE_Z,
     NutParams,
     NutState,
     handle_of,
@@ -23,13 +24,21 @@ from envs.manipulation.nut import (
 
 GAIN = 12.0  # 1/m, action per distance
 TURN = 2.0  # action per rad
-HOVER = 0.08  # m above the handle on the way
-CARRY = 0.99  # m, height of the ring on its way to the peg
-ALIGNED, LOST = (0.010, 0.12), (0.022, 0.30)  # m and rad: to go down; not to go up again
-LEVEL = 0.012  # m, of the gripper above the handle: where it may close
-OVER, DRIFTED = 0.009, 0.020  # m from the peg's axis: to lower; not to rise again
-LOWER = 0.80  # m, height aimed at on the peg
-CLOSED = 0.98  # command: the ring is lifted once it has reached it
+HOVER = 0.08  # m above the handle, where gripper and handle are not in line
+ALIGNED, LOST = 0.5, 1.0  # misalignment up to which to be down, from which to be up
+ASIDE, ASKEW = 0.035, 0.50  # m and rad, of misalignment 1
+LEVEL = (0.012, 0.025)  # m, of the gripper above the handle: where it closes, and stays closed
+CARRY, LOWER = 0.99, 0.80  # m, height of the ring on its way to the peg and aimed at on it
+LIFTED = (0.93, 0.97)  # m, between which the ring sets off to the side
+OVER, OFF = 0.009, 0.016  # m from the peg's axis: up to which to be down, from which to be up
+TIGHT = (0.6, 1.0)  # command, between which the ring is lifted
+GENTLE = 0.3  # lift from the table
+EMPTY = (0.36, 0.42)  # rad, of the knuckles: closed farther than a handle lets them
+
+
+def _ramp(value: jax.Array, low: float, high: float) -> jax.Array:
+    """0 below `low`, 1 above `high`, straight between them."""
+    return jnp.clip((value - low) / (high - low), 0.0, 1.0)
 
 
 def scripted_expert(
@@ -53,35 +62,28 @@ def scripted_expert(
     tilt = jnp.cross(axes[2], down)
     turn = jnp.clip(TURN * jnp.array([tilt[0], tilt[1], yaw]), -1.0, 1.0)
 
+    # height over the handle is a funnel: the better in line, the lower
     off = handle - eef
-    aside = jnp.sqrt(jnp.sum(off[:2] ** 2))
-    above = -off[2]
-    # on the way down it may stray farther before it goes up again
-    low = above < 0.6 * HOVER
-    near = aside < jnp.where(low, LOST[0], ALIGNED[0])
-    straight = jnp.abs(yaw) < jnp.where(low, LOST[1], ALIGNED[1])
-    ready = near & straight
-    height = jnp.where(ready, 0.0, HOVER)
-    reach = jnp.append(off[:2], off[2] + height)
-    around = ready & (jnp.abs(above) < LEVEL)
-    holding = state.touching | (around & (state.command > 0.5))
+    aside = jnp.sqrt(jnp.sum(off[:2] ** 2) + 1e-12)
+    wrong = jnp.maximum(aside / ASIDE, jnp.abs(yaw) / ASKEW)
+    empty = _ramp(jnp.mean(state.fingers[::3]), *EMPTY)
+    reach = off.at[2].add(HOVER * jnp.maximum(_ramp(wrong, ALIGNED, LOST), empty))
+    level = LEVEL[0] + (LEVEL[1] - LEVEL[0]) * _ramp(state.command, -1.0, 0.0)
+    around = (wrong < LOST) & (jnp.abs(off[2]) < level)
 
+    # and so is height over the peg
     peg = jnp.array(PEG[:2]) - position[:2]
-    beside = jnp.sqrt(jnp.sum(peg**2))
-    lowering = position[2] < CARRY - 0.03
-    over = beside < jnp.where(lowering, DRIFTED, OVER)
-    lifted = position[2] > CARRY - 0.02
-    rise = CARRY - position[2]
-    carry = jnp.where(
-        over,
-        jnp.append(peg, LOWER - position[2]),
-        jnp.where(lifted, jnp.append(peg, rise), jnp.append(0.0 * peg, rise)),
-    )
-    carry = carry.at[2].set(jnp.where(over, jnp.maximum(carry[2], -0.5 / GAIN), carry[2]))
-    carry = jnp.where(state.touching & (state.command > CLOSED), carry, 0.0)
+    beside = jnp.sqrt(jnp.sum(peg**2) + 1e-12)
+    height = LOWER + (CARRY - LOWER) * _ramp(beside, OVER, OFF)
+    free = jnp.maximum(_ramp(position[2], *LIFTED), 1 - _ramp(beside, 2 * OFF, 3 * OFF))
+    tight = _ramp(state.command, *TIGHT)
+    carry = tight * jnp.append(free * peg, height - position[2])
+    gentle = GENTLE + (1 - GENTLE) * _ramp(position[2], PLACE_Z - 0.06, LIFTED[0])
 
-    move = jnp.clip(GAIN * jnp.where(holding, carry, reach), -1.0, 1.0)
-    move = move.at[2].set(jnp.where(holding, move[2], jnp.maximum(move[2], -0.6)))
-    turn = jnp.where(holding, 0.5 * turn.at[2].set(0.0), turn)
-    grip = jnp.where(around | holding, 1.0, -1.0)
+    touching = state.touching
+    move = jnp.clip(GAIN * jnp.where(touching, carry, reach), -1.0, 1.0)
+    limit = jnp.where(touching, gentle, 1.0)
+    move = move.at[2].set(jnp.clip(move[2], -0.5, limit))
+    turn = jnp.where(touching, 0.5 * turn.at[2].set(0.0), turn)
+    grip = jnp.where(around | touching, 1.0, -1.0)
     return jnp.concatenate([move, turn, grip[None]])
