@@ -50,12 +50,12 @@ class Train:
     """Of Adam."""
     min_speed: float | None = None
     """Gate: predicted mean speed below which the expert takes over, m/s."""
-    gate: Literal["unsafe_or_slow", "low_return", "falls_short"] | None = None
+    gate: Literal["unsafe_or_slow", "low_return", "departs"] | None = None
     """What makes the expert take over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
-    min_share: float | None = None
-    """Gate falls_short: share of the expert's own predicted return."""
+    max_departure: float | None = None
+    """Gate departs: how far from the expert's own path, in the world's units."""
     batch_size: int | None = None
     """Samples per loss and update."""
     predictor: Literal["simulator", "kinematic"] | None = None
@@ -100,8 +100,12 @@ class Compare:
     """Environment steps of each run."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
-    gate: Literal["unsafe_or_slow", "low_return", "falls_short"] | None = None
+    gate: Literal["unsafe_or_slow", "low_return", "departs"] | None = None
     """What makes the expert take over (default: the paper's rule for the world)."""
+    min_return: float | None = None
+    """Gate low_return: predicted return at or below which the expert takes over."""
+    max_departure: float | None = None
+    """Gate departs: how far from the expert's own path, in the world's units."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
     scenarios: str | None = None

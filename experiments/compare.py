@@ -71,7 +71,8 @@ def _start(command: Compare, job: tuple[str, int], run: Path) -> subprocess.Pope
         "--out",
         str(run),
     ]
-    names = ("preset", "total_steps", "evaluate_every", "gate", "scenarios", "held_out_scenarios")
+    names = ("preset", "total_steps", "evaluate_every", "gate", "min_return", "max_departure")
+    names += ("scenarios", "held_out_scenarios")
     for name in names:
         value = getattr(command, name)
         if value is not None:

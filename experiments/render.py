@@ -64,7 +64,11 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
     config, hparams = default(env.name)
-    rule, key = RULES[config.gate], jax.random.key(0)
+    rule, key, scale = (
+        RULES[config.gate],
+        jax.random.key(0),
+        jnp.asarray(env.spec.observation_scale),
+    )
     state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
     if env.name == "driving":
         place, picture = _driving(env, state)
@@ -89,7 +93,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
         after, outcome = env.transition(key, state, action, params)
         novice = positions(state, act, held=True)
         expert = positions(state, env.scripted_expert, held=False)
-        return after, outcome, novice, rule(trajectory, None, hparams), expert
+        return after, outcome, novice, rule(trajectory, None, hparams, scale), expert
 
     frames = []
     for t in range(steps):

@@ -28,8 +28,8 @@ class HParams:
         min_speed: Gate: the expert takes over where the predicted mean speed is below, m/s.
         min_return: Gate of the released code and of manipulation: where the predicted return is
             at or below (the paper's epsilon).
-        min_share: Gate "falls_short": where the prediction returns less than this share of what
-            the expert would.
+        max_departure: Gate "departs": how far the prediction may end from where the expert would,
+            in the world's units (`WorldSpec.observation_scale`).
     """
 
     preference_horizon: jax.Array | float = 4
@@ -42,7 +42,7 @@ class HParams:
     learning_rate: jax.Array | float = 3e-4
     min_speed: jax.Array | float = 5.0
     min_return: jax.Array | float = 10.0
-    min_share: jax.Array | float = 0.5
+    max_departure: jax.Array | float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,9 +58,9 @@ class TrainConfig:
         hidden: Widths of the policy's hidden layers.
         human_capacity, preference_capacity: Of the ring buffers; the oldest go first.
         predictor: The world's own transition, or the rule-based kinematic one.
-        gate: What makes the expert take over: an unsafe or slow prediction, a low return, or a
-            return that falls short of what the expert itself would get from here (one more
-            lookahead per decision; it does not fire where nobody could get more).
+        gate: What makes the expert take over: an unsafe or slow prediction, a low return, or one
+            that departs from what the expert would do from here (one more lookahead per decision;
+            it asks the policy again at every predicted state).
         gate_rollout: The lookahead holds the proposed action, or asks the policy again at every
             predicted state.
         pair_states: Pairs at predicted states 1..L, or as the released code makes them: preferred
@@ -79,7 +79,7 @@ class TrainConfig:
     human_capacity: int = 50_000
     preference_capacity: int = 50_000
     predictor: Literal["simulator", "kinematic"] = "simulator"
-    gate: Literal["unsafe_or_slow", "low_return", "falls_short"] = "unsafe_or_slow"
+    gate: Literal["unsafe_or_slow", "low_return", "departs"] = "unsafe_or_slow"
     gate_rollout: Literal["constant", "closed_loop"] = "constant"
     pair_states: Literal["predicted", "shifted"] = "predicted"
     likelihood: Literal["gaussian", "laplace"] = "gaussian"
@@ -87,15 +87,20 @@ class TrainConfig:
     random_steps: int = 0
 
 
-# what the paper sets per task (section 5 and its appendix)
+# what the paper sets per task where it differs from driving (section 5 and its appendix)
 _TASKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "driving": ({}, {}),
     "table_wiping": (
-        {"total_steps": 4000, "gate": "low_return"},
+        {"total_steps": 4000, "gate": "low_return", "max_preference_horizon": 4},
         {"preference_horizon": 4, "min_return": 1.0},
     ),
     "nut_assembly": (
-        {"total_steps": 200_000, "gate": "low_return", "preference_capacity": 200_000},
+        {
+            "total_steps": 200_000,
+            "gate": "low_return",
+            "max_preference_horizon": 6,
+            "human_capacity": 200_000,
+            "preference_capacity": 200_000,
+        },
         {"preference_horizon": 6, "min_return": 2.0},
     ),
 }
@@ -133,7 +138,7 @@ def reference(task: str = "driving") -> tuple[TrainConfig, HParams]:
     Raises:
         ValueError: For another task.
     """
-    if task in _TASKS and task != "driving":
+    if task in _TASKS:
         raise ValueError(
             f"preset 'reference' is for driving alone, got {task}: choose default or paper"
         )

@@ -1,7 +1,8 @@
 """Takeover rules: would the predicted trajectory fail?
 
-`rule(trajectory, experts, hparams) -> bool`; `experts` is what the expert itself is predicted to do
-from here, for rules in `COMPARING`, and None for the others.
+`rule(trajectory, experts, hparams, scale) -> bool`; `experts` is what the expert itself is
+predicted to do from here, for rules in `COMPARING`, and None for the others; `scale` is the world's
+`observation_scale`.
 """
 
 from __future__ import annotations
@@ -10,53 +11,62 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ppl_jax.config import HParams
 from ppl_jax.types import Trajectory
 
-Rule = Callable[[Trajectory, "Trajectory | None", HParams], jax.Array]
+Scale = np.ndarray | jax.Array
+Rule = Callable[[Trajectory, Trajectory | None, HParams, Scale], jax.Array]
 
 
 def unsafe_or_slow(
-    trajectory: Trajectory, experts: Trajectory | None, hparams: HParams
+    trajectory: Trajectory, experts: Trajectory | None, hparams: HParams, scale: Scale
 ) -> jax.Array:
     """The paper's driving rule: any predicted crash or leaving the road, or mean speed too low.
 
     A prediction that ends in success is not slow.
     """
-    del experts
+    del experts, scale
     steps = jnp.maximum(jnp.sum(trajectory.valid), 1)
     mean_speed = jnp.sum(trajectory.speed * trajectory.valid) / steps
     slow = (mean_speed < hparams.min_speed) & ~jnp.any(trajectory.success)
     return jnp.any(trajectory.unsafe) | slow
 
 
-def low_return(trajectory: Trajectory, experts: Trajectory | None, hparams: HParams) -> jax.Array:
+def low_return(
+    trajectory: Trajectory, experts: Trajectory | None, hparams: HParams, scale: Scale
+) -> jax.Array:
     """The released code's rule: the prediction ends with a negative reward, or returns too little.
 
     An arrival in the first predicted step (return 10) counts as a failure there, and here.
     """
-    del experts
+    del experts, scale
     failed = jnp.any(trajectory.terminated & (trajectory.reward < 0))
     return failed | (jnp.sum(trajectory.reward) <= hparams.min_return)
 
 
-def falls_short(trajectory: Trajectory, experts: Trajectory | None, hparams: HParams) -> jax.Array:
-    """The prediction fails, or returns less than a share of what the expert would from here.
+def departs(
+    trajectory: Trajectory, experts: Trajectory | None, hparams: HParams, scale: Scale
+) -> jax.Array:
+    """The prediction fails, or ends elsewhere than the expert would from here.
 
-    A threshold on the return alone also fires where nobody can earn it yet: on the expert's own
-    way to the dirt or to the ring. A prediction that succeeds never falls short.
+        max_i |s_i - s*_i| / scale_i > max_departure
+
+    with s, s* the two last predicted observations. A threshold on the return also fires where
+    nobody can earn it yet (on the expert's own way to the ring), and does not fire where standing
+    still earns enough (holding it). A prediction that succeeds does not depart.
     """
     if experts is None:
-        raise ValueError("gate 'falls_short' needs the expert's own prediction")
-    failed = jnp.any(trajectory.unsafe)
-    needed = hparams.min_share * jnp.sum(experts.reward)
-    return failed | ((jnp.sum(trajectory.reward) < needed) & ~jnp.any(trajectory.success))
+        raise ValueError("gate 'departs' needs the expert's own prediction")
+    apart = jnp.max(jnp.abs(trajectory.observation[-1] - experts.observation[-1]) / scale)
+    elsewhere = (apart > hparams.max_departure) & ~jnp.any(trajectory.success)
+    return jnp.any(trajectory.unsafe) | elsewhere
 
 
 RULES: dict[str, Rule] = {
     "unsafe_or_slow": unsafe_or_slow,
     "low_return": low_return,
-    "falls_short": falls_short,
+    "departs": departs,
 }
-COMPARING = ("falls_short",)
+COMPARING = ("departs",)

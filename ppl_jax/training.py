@@ -140,8 +140,8 @@ def make_train(
         key_propose, key_predict = jax.random.split(key)
         observation = env.observe(learner.env_state, params)
         action = propose(learner, key_propose, observation)
-        asked_again = config.gate_rollout == "closed_loop"
-        trajectory = predict(
+        roll = functools.partial(
+            predict,
             env,
             transition,
             key_predict,
@@ -149,50 +149,39 @@ def make_train(
             action,
             params,
             config.prediction_horizon,
-            act=functools.partial(algorithm.act, learner.algorithm) if asked_again else None,
+            observe=algorithm.compares,
         )
-        experts = None
-        if algorithm.compares:
-            experts = predict(
-                env,
-                transition,
-                key_predict,
-                learner.env_state,
-                action,
-                params,
-                config.prediction_horizon,
-                expert=expert,
-            )
+        asked_again = config.gate_rollout == "closed_loop" or algorithm.compares
+        act = functools.partial(algorithm.act, learner.algorithm)
+        trajectory = roll(act=act if asked_again else None)
+        experts = roll(expert=expert) if algorithm.compares else None
         return algorithm.decide(learner.algorithm, trajectory, experts, learner.hparams)
+
+    def ahead(
+        takeover: jax.Array, key: jax.Array, state: PyTree, action: jax.Array, params: PyTree
+    ) -> Trajectory:
+        def roll() -> Trajectory:
+            horizon = config.max_preference_horizon
+            return predict(env, transition, key, state, action, params, horizon, observe=True)
+
+        def nothing() -> Trajectory:
+            return jax.tree.map(
+                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(roll)
+            )
+
+        return jax.lax.cond(takeover, roll, nothing)
+
+    if jax.default_backend() == "cpu":
+        # a batched cond makes every lane pay for the lookahead; one lane after another, only those
+        # whose expert is in control do (a core is as fast with one lane as with many)
+        ahead = jax.custom_batching.sequential_vmap(ahead)
 
     def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
         """The first predicted states, for the pairs; skipped while the novice is in control."""
-        horizon = config.max_preference_horizon
         key_predict, key_noise = jax.random.split(key)
-
-        def ahead(_: Any) -> Trajectory:
-            return predict(
-                env,
-                transition,
-                key_predict,
-                learner.env_state,
-                action,
-                params,
-                horizon,
-                observe=True,
-            )
-
-        def nothing(_: Any) -> Trajectory:
-            shapes = jax.eval_shape(ahead, None)
-            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-        trajectory = jax.lax.cond(learner.takeover, ahead, nothing, None)
-        return dataclasses.replace(
-            trajectory,
-            observation=add_noise(
-                key_noise, trajectory.observation, learner.hparams.prediction_noise
-            ),
-        )
+        trajectory = ahead(learner.takeover, key_predict, learner.env_state, action, params)
+        noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
+        return dataclasses.replace(trajectory, observation=noisy)
 
     def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
         """One environment step: act, store, update."""

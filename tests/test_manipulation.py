@@ -11,11 +11,9 @@ import pytest
 from envs.manipulation import arm, control, grasp, nut, pad, wiping
 from envs.manipulation.markers import COUNT, SPACING, draw_markers
 from envs.manipulation.model import GRIPPER, INITIAL_JOINTS, TIMESTEP, WIPER
-from ppl_jax.config import PRESETS, HParams
+from ppl_jax.config import PRESETS
 from ppl_jax.evaluation import make_evaluate
-from ppl_jax.intervention import falls_short
 from ppl_jax.predictor import predict
-from ppl_jax.types import Trajectory
 
 KEY = jax.random.key(0)
 WORLDS = ("table_wiping", "nut_assembly")
@@ -293,7 +291,7 @@ def test_contact_does_not_vanish():
         columns = arm.jacobian(at)
         mass = arm.mass_matrix(at, WIPER)
         zero = [jnp.zeros(())] * 6
-        motion = control.Motion(at, columns, control.twist_of(columns, zero), mass, [], zero, zero)
+        motion = control.Motion(at, columns, control.twist_of(columns, zero), mass, zero, zero)
         table = float(at.position[2]) + depth
         forces = []
         for begin in (jnp.zeros(6), jnp.full(6, 50.0)):
@@ -365,28 +363,6 @@ def test_presets_of_the_tasks():
     assert (config.total_steps, hparams.preference_horizon, hparams.min_return) == (200_000, 6, 2.0)
     with pytest.raises(ValueError, match="driving alone"):
         PRESETS["reference"]("table_wiping")
-
-
-def test_gate_that_compares_with_the_expert():
-    def rewards(value, unsafe=False):
-        flags = jnp.zeros(4, bool)
-        return Trajectory(
-            jnp.zeros((4, 0)),
-            jnp.full(4, value),
-            jnp.zeros(4),
-            flags | unsafe,
-            flags,
-            flags,
-            ~flags,
-        )
-
-    hparams = HParams(min_share=0.5)
-    assert not bool(falls_short(rewards(0.1), rewards(0.15), hparams))
-    assert bool(falls_short(rewards(0.1), rewards(0.3), hparams))
-    assert bool(falls_short(rewards(0.3, unsafe=True), rewards(0.3), hparams))
-    assert not bool(falls_short(rewards(0.0), rewards(0.0), hparams))
-    with pytest.raises(ValueError, match="expert's own prediction"):
-        falls_short(rewards(0.0), None, hparams)
 
 
 # ---- against robosuite

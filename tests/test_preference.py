@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from ppl_jax.config import HParams
-from ppl_jax.intervention import low_return, unsafe_or_slow
+from ppl_jax.intervention import departs, low_return, unsafe_or_slow
 from ppl_jax.preference import preference_pairs
 from ppl_jax.types import Interaction, Trajectory
 
 M, O, A = 6, 4, 2
+SCALE = np.array([1.0, 1.0, 2.0, 1.0], np.float32)
 
 
 def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=()):
@@ -90,7 +91,7 @@ def test_changing_the_horizon_compiles_nothing():
     ],
 )
 def test_the_driving_gate(case, expected):
-    assert bool(unsafe_or_slow(trajectory(**case), None, HParams(min_speed=5.0))) is expected
+    assert bool(unsafe_or_slow(trajectory(**case), None, HParams(min_speed=5.0), SCALE)) is expected
 
 
 @pytest.mark.parametrize(
@@ -103,4 +104,23 @@ def test_the_driving_gate(case, expected):
     ],
 )
 def test_the_released_gate(case, expected):
-    assert bool(low_return(trajectory(**case), None, HParams(min_return=10.0))) is expected
+    assert bool(low_return(trajectory(**case), None, HParams(min_return=10.0), SCALE)) is expected
+
+
+@pytest.mark.parametrize(
+    ("case", "shift", "expected"),
+    [
+        ({}, [0.9, 0.0, 1.9, 0.0], False),
+        ({}, [0.0, 0.0, 2.1, 0.0], True),
+        ({"success": [3]}, [0.0, 0.0, 2.1, 0.0], False),
+        ({"unsafe": [4]}, [0.0, 0.0, 0.0, 0.0], True),
+    ],
+)
+def test_the_gate_that_compares_with_the_expert(case, shift, expected):
+    novice = trajectory(**case)
+    experts = trajectory()
+    experts = experts.replace(observation=experts.observation.at[-1].add(jnp.array(shift)))
+    hparams = HParams(max_departure=1.0)
+    assert bool(departs(novice, experts, hparams, SCALE)) is expected
+    with pytest.raises(ValueError, match="expert's own prediction"):
+        departs(novice, None, hparams, SCALE)

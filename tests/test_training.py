@@ -120,6 +120,33 @@ def test_a_vmapped_batch_is_the_runs_one_by_one():
     assert train._cache_size() == 1  # another L, beta, noise or seed compiles nothing
 
 
+def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
+    """Counts calls of the transition under vmap: a batched cond would run it in every lane."""
+    calls = []
+
+    class Counting(Probe):
+        def transition(self, key, state, action, params):
+            jax.debug.callback(lambda *_: calls.append(1), state.time)
+            return super().transition(key, state, action, params)
+
+    probe = Counting()
+    config = dataclasses.replace(TINY, total_steps=5)
+    gate = make_train(probe, probe.scripted_expert, ALGORITHMS["ppl"], config).algorithm
+    # the expert takes over in the lanes whose observation shows +1
+    gate = gate._replace(
+        decide=lambda state, trajectory, experts, hparams: trajectory.observation[0, 0] > 0,
+        compares=True,
+    )
+    fns = make_train(probe, probe.scripted_expert, lambda spec, config: gate, config)
+    keys = jax.random.split(jax.random.key(0), 8)
+    learners, _ = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))(keys, HP)
+    jax.effects_barrier()
+    taken = int(jnp.sum(learners.counters.human_data))
+    assert 0 < taken < 8 * 5
+    # two lookaheads of the gate in each lane, every step, and what the experts' steps look ahead
+    assert len(calls) == 8 * (2 * 6 + 5) + 6 * taken
+
+
 def test_chunks_are_the_whole_run_bit_for_bit():
     _, fns = functions(total_steps=60)
     chunk = jax.jit(fns.run_chunk, static_argnums=1)

@@ -35,22 +35,22 @@ class Frames(NamedTuple):
 
 
 def add(a: Vector, b: Vector) -> Vector:
-    """A + b."""
+    """The sum a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def scale(k: Scalar, a: Vector) -> Vector:
-    """K a."""
+    """The multiple k a."""
     return (k * a[0], k * a[1], k * a[2])
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """A . b."""
+    """The inner product a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """A x b."""
+    """The cross product a x b."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -59,7 +59,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def combine(m: Matrix, v: Vector) -> Vector:
-    """M v; components of `v` that are plain zeros cost nothing."""
+    """The product m v; components of `v` that are plain zeros cost nothing."""
     total: Vector | None = None
     for column, k in zip(m, v, strict=True):
         if isinstance(k, float) and k == 0.0:
@@ -180,7 +180,6 @@ def bias_torque(at: Frames, tool: Tool, speeds: list[Scalar]) -> list[Scalar]:
     """Torques of gravity and of the Coriolis and centrifugal forces (MuJoCo's qfrc_bias)."""
     spin: Vector = (0.0, 0.0, 0.0)
     turn: Vector = (0.0, 0.0, 0.0)  # angular acceleration at zero joint acceleration
-    velocity: Vector = (0.0, 0.0, 0.0)  # of the last anchor
     acceleration: Vector = (0.0, 0.0, 9.81)
     last: Vector = (0.0, 0.0, 0.0)
     wrenches = []
@@ -189,7 +188,6 @@ def bias_torque(at: Frames, tool: Tool, speeds: list[Scalar]) -> list[Scalar]:
         arm = add(at.anchors[j], scale(-1.0, last))
         swept = cross(spin, arm)
         acceleration = add(acceleration, add(cross(turn, arm), cross(spin, swept)))
-        velocity = add(velocity, swept)
         last = at.anchors[j]
         own = scale(speeds[j], at.axes[j])
         turn = add(turn, cross(spin, own))

@@ -18,6 +18,23 @@ def impedance(depth: jax.Array, low: float, high: float, width: float) -> jax.Ar
     return low + (high - low) * y
 
 
+def _zones(residual: jax.Array, weight: jax.Array, friction: np.ndarray | float):
+    """mu, |r_xy|, the sliding zone's weight, its gap n - mu t, and where the point sticks."""
+    x, y, z = residual
+    mu = friction / IMPEDANCE_RATIO**0.5
+    slide = jnp.sqrt(x * x + y * y + 1e-12)
+    normal, tangent = mu * z, friction * slide
+    middle = weight / (mu * mu * (1 + mu * mu))
+    return mu, slide, middle, normal - mu * tangent, mu * normal + tangent <= 0
+
+
+def cone_cost(residual: jax.Array, weight: jax.Array, friction: np.ndarray | float) -> jax.Array:
+    """The elliptic cones' cost, summed over the points; arguments as for `cone`."""
+    _, slide, middle, gap, stuck = _zones(residual, weight, friction)
+    held = 0.5 * weight * (residual[2] ** 2 + IMPEDANCE_RATIO * slide * slide)
+    return jnp.sum(jnp.where(stuck, held, jnp.where(gap < 0, 0.5 * middle * gap * gap, 0.0)))
+
+
 def cone(
     residual: jax.Array, weight: jax.Array, friction: np.ndarray | float
 ) -> tuple[jax.Array, jax.Array]:
@@ -35,13 +52,8 @@ def cone(
         [3, P] force, and xx, xy, yy, xz, yz, zz of the second derivative, [6, P].
     """
     x, y, z = residual
-    mu = friction / IMPEDANCE_RATIO**0.5
-    slide = jnp.sqrt(x * x + y * y + 1e-12)
+    mu, slide, middle, gap, stuck = _zones(residual, weight, friction)
     tx, ty = x / slide, y / slide
-    middle = weight / (mu * mu * (1 + mu * mu))
-    normal, tangent = mu * z, friction * slide
-    gap = normal - mu * tangent
-    stuck = mu * normal + tangent <= 0
     sliding = (gap < 0) & ~stuck
     fz = jnp.where(stuck, -weight * z, jnp.where(sliding, -middle * gap * mu, 0.0))
     held = weight * IMPEDANCE_RATIO

@@ -85,7 +85,7 @@ class Motion(NamedTuple):
         at: Kinematics.
         columns: Jacobian of the grip site, per joint (linear, angular).
         twist: Velocity of the grip site, m/s and rad/s.
-        matrix, factor: Mass matrix and its Cholesky factor.
+        matrix: Mass matrix.
         acceleration: Of the joints, without contact, rad/s^2.
         speeds: Of the joints, rad/s.
     """
@@ -94,13 +94,12 @@ class Motion(NamedTuple):
     columns: list[tuple[Vector, Vector]]
     twist: tuple[Vector, Vector]
     matrix: small.Rows
-    factor: small.Rows
     acceleration: list[Scalar]
     speeds: list[Scalar]
 
 
 def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple[Vector, Vector]:
-    """J rates."""
+    """The product J rates."""
     linear = angular = (0.0, 0.0, 0.0)
     for (a, b), rate in zip(columns, rates, strict=True):
         linear, angular = add(linear, scale(rate, a)), add(angular, scale(rate, b))
@@ -108,7 +107,7 @@ def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple
 
 
 def joint_torque(columns: list[tuple[Vector, Vector]], force: Vector, torque: Vector):
-    """J' [force, torque]."""
+    """The product J' [force, torque]."""
     return [dot(a, force) + dot(b, torque) for a, b in columns]
 
 
@@ -183,4 +182,4 @@ def free_motion(
         applied = jnp.clip(task[index] + weight[index], -limit, limit) - weight[index]
         brake = DAMPING * speeds[index] + FRICTION_LOSS * jnp.tanh(speeds[index] / _SETTLING)
         net.append(applied + air[index] - brake)
-    return Motion(at, columns, (linear, angular), matrix, factor, small.solve(factor, net), speeds)
+    return Motion(at, columns, (linear, angular), matrix, small.solve(factor, net), speeds)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.manipulation.model import WIPING_TABLE
 from envs.manipulation.twin import NutTwin, WipingTwin, make_twin
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
@@ -89,7 +88,6 @@ class ArmScene:
 
         self.mujoco = mujoco
         self.twin: WipingTwin | NutTwin = make_twin(env)
-        self.name = env.name
         self.model, self.data = self.twin.arm.model, self.twin.arm.data
         self.renderer = _renderer(mujoco, self.model, *size)
         self.camera = mujoco.MjvCamera()
@@ -101,9 +99,6 @@ class ArmScene:
     def draw(self, state: Any, paths: ArmPaths | None = None) -> np.ndarray:
         """Picture of a state, [height, width, 3] of bytes."""
         self.twin.place(state)
-        if self.name == "table_wiping":
-            self.data.mocap_pos[:, :2] = np.asarray(state.markers)
-            self.data.mocap_pos[:, 2] = np.where(state.wiped, -1.0, WIPING_TABLE[2])
         self.mujoco.mj_forward(self.model, self.data)
         self.renderer.update_scene(self.data, self.camera, self.options)
         scene = self.renderer.scene

@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.compiler import set_xla_flags
-from envs.manipulation import nut, wiping
+from envs.manipulation import nut, small, wiping
 from envs.manipulation.arm import frames
-from envs.manipulation.model import GRIPPER, NUT_BASE, WIPER, WIPING_BASE
+from envs.manipulation.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, WIPING_BASE
 
 FREE_STEPS, WINDOW = 20, 10
 _LONGEST = 250  # steps that a compiled replay holds; longer recordings are replayed in parts
@@ -95,14 +95,12 @@ def nut_state(record: Any, row: Any, prefix: str = "") -> nut.NutState:
     )
 
 
-def _replay(env: Any, state: Any, actions: jax.Array) -> tuple[Any, jax.Array, jax.Array, Any]:
+def _replay(env: Any, state: Any, actions: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
     """States, rewards and observations after each action; the episode's end is ignored."""
 
     def step(state: Any, action: jax.Array) -> Any:
-        force = wiping.advance(state, action)[4] if env is _WIPING else jnp.zeros(3)
         state, outcome = env.transition(_KEY, state, action, env.default_params)
-        observation = env.observe(state, env.default_params)
-        return state, (state, outcome.reward, observation, force)
+        return state, (state, outcome.reward, env.observe(state, env.default_params))
 
     return jax.lax.scan(step, state, actions)[1]
 
@@ -157,9 +155,8 @@ def _grip_site(env: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
     tool, base = (WIPER, WIPING_BASE) if env is _WIPING else (GRIPPER, NUT_BASE)
 
     def one(joints: jax.Array, speeds: jax.Array) -> tuple[jax.Array, jax.Array]:
-        at = frames(list(joints - 0.002 * speeds), tool)
-        columns = [jnp.stack(list(column)) for column in at.rotation]
-        return jnp.stack(at.position) + jnp.array(base), jnp.stack(columns, -1)
+        at = frames(list(joints - TIMESTEP * speeds), tool)
+        return jnp.stack(at.position) + jnp.array(base), small.array(at.rotation).T
 
     places, turns = jax.jit(jax.vmap(one))(states.joints, states.speeds)
     return np.asarray(places), np.asarray(turns)
@@ -203,6 +200,14 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(2 * np.arcsin(min(np.linalg.norm(a - b) / 8**0.5, 1.0)))
 
 
+@jax.jit
+@jax.vmap
+def _push_up(state: wiping.WipingState) -> jax.Array:
+    """The table's push on the wiper, N: the wrist's sensor, turned up, and the wiper's weight."""
+    turn = small.array(wiping.lagged_frames(state, WIPER).rotation)
+    return (-turn.T @ state.force)[2] + 9.81 * WIPER.mass
+
+
 def _press(folder: Path) -> float | None:
     found = _load(folder, "press.npz")
     if not found:
@@ -210,9 +215,10 @@ def _press(folder: Path) -> float | None:
     record, errors = found[0], []
     for run in range(len(record["action"])):
         state = wiping_state(record, (run, 0))
-        force = np.asarray(_replay_one(_WIPING, state, jnp.float32(record["action"][run]))[3])
+        after = _replay_one(_WIPING, state, jnp.float32(record["action"][run]))[0]
+        push = np.asarray(_push_up(after))[-10:].mean()
         wanted = record["contact_force"][run, -10:, 2].mean()
-        errors.append(abs(force[-10:, 2].mean() - wanted) / wanted)
+        errors.append(abs(push - wanted) / wanted)
     return float(max(errors))
 
 
@@ -249,7 +255,7 @@ def _nut_windows(folder: Path) -> tuple[float | None, float | None]:
             rings.append(record["nut_pos"][row + 1 : row + 1 + WINDOW])
     if not states:
         return None, None
-    _, reward, observation, _ = _windows(_NUT, states, actions)
+    _, reward, observation = _windows(_NUT, states, actions)
     agree = np.abs(reward - np.array(rewards)) < 0.05
     off = np.linalg.norm(observation[:, :, :3] - np.array(rings), axis=-1)
     return float(agree.mean()), float(np.median(off))

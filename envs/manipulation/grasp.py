@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation import gripper, small
-from envs.manipulation.contact import IMPEDANCE_RATIO, cone
+from envs.manipulation.contact import cone, cone_cost
 from envs.manipulation.control import Motion
 from envs.manipulation.model import (
     HANDLE,
@@ -99,7 +99,7 @@ class _Points(NamedTuple):
 def hand_axes(motion: Motion) -> tuple[jax.Array, jax.Array]:
     """Origin [3] and axes [3, 3] (rows x, y, z) of the hand."""
     position, columns = motion.at.links[6]
-    return jnp.stack(position), jnp.stack([jnp.stack(column) for column in columns])
+    return jnp.stack(position), small.array(columns)
 
 
 def pad_points(
@@ -196,8 +196,8 @@ def hold(
 
     carried = _PADS + 2  # by a finger; the rest belong to the ring, and so do the pads' partners
     site = jnp.stack(motion.at.position)
-    linear = jnp.stack([jnp.stack(part) for part, _ in motion.columns])  # [6, 3]
-    angular = jnp.stack([jnp.stack(part) for _, part in motion.columns])
+    linear = small.array(part for part, _ in motion.columns)  # [6, 3]
+    angular = small.array(part for _, part in motion.columns)
     arm_place = place[:carried] - site
     swept = linear[:, None] + jnp.cross(angular[:, None], arm_place[None])  # [6, F, 3]
     by_arm = jnp.sum(frame[:, :carried, None] * jnp.swapaxes(swept, 0, 1)[None], -1)  # [3, F, 6]
@@ -240,14 +240,11 @@ def hold(
         lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
         matrix = mass + jnp.concatenate([by_mover, lower])
         residual = flat.T @ force.reshape(-1) - mass @ (a - free)
-        factor = small.settle(
-            small.cholesky([[matrix[i, j] for j in range(14)] for i in range(14)])
-        )
-        return a + jnp.stack(small.solve(factor, [residual[i] for i in range(14)]))
+        return a + small.solve_array(matrix, residual)
 
     def cost(a: jax.Array) -> jax.Array:
         off = a - free
-        return 0.5 * off @ mass @ off + _cone_cost(rows @ a + rest, weight, friction)
+        return 0.5 * off @ mass @ off + cone_cost(rows @ a + rest, weight, friction)
 
     def iterate(_: jax.Array, a: jax.Array) -> jax.Array:
         new = improve(a)
@@ -255,25 +252,13 @@ def hold(
         half = 0.5 * (a + new)
         return jnp.where(cost(half) < cost(new), half, new)
 
-    # a loop, not four copies: the compiler's time is most of what a newcomer waits for
+    # a loop, not a copy per iteration: the compiler's time is most of what a newcomer waits for
     a = jnp.where(cost(start) < cost(free), start, free)
     a = jax.lax.fori_loop(0, ITERATIONS, iterate, a)
     force, _ = cone(rows @ a + rest, weight, friction)
     squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
     touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
     return Held(a, jnp.sum(squeeze, -1), touching)
-
-
-def _cone_cost(residual: jax.Array, weight: jax.Array, friction: np.ndarray) -> jax.Array:
-    x, y, z = residual
-    mu = friction / IMPEDANCE_RATIO**0.5
-    slide = jnp.sqrt(x * x + y * y + 1e-12)
-    middle = weight / (mu * mu * (1 + mu * mu))
-    normal, tangent = mu * z, friction * slide
-    gap = normal - mu * tangent
-    stuck = mu * normal + tangent <= 0
-    held = 0.5 * weight * (z * z + IMPEDANCE_RATIO * slide * slide)
-    return jnp.sum(jnp.where(stuck, held, jnp.where(gap < 0, 0.5 * middle * gap * gap, 0.0)))
 
 
 def _inertia(
@@ -308,14 +293,8 @@ def _inertia(
     force = weight - whirl - RING_DAMPING * ring.velocity
     torque = jnp.cross(centre, weight) - jnp.cross(spin, about @ spin) - RING_DAMPING * spin
     own = jnp.block([[RING_MASS * jnp.eye(3), -skew], [skew, about]])
-    ring_free = _solve6(own, jnp.concatenate([force, torque]))
+    ring_free = small.solve_array(own, jnp.concatenate([force, torque]))
 
-    arm = jnp.stack([entry for row in motion.matrix for entry in row]).reshape(6, 6)
-    mass = jnp.zeros((14, 14)).at[:6, :6].set(arm).at[8:, 8:].set(own)
+    mass = jnp.zeros((14, 14)).at[:6, :6].set(small.array(motion.matrix)).at[8:, 8:].set(own)
     mass = mass.at[6, 6].set(finger_mass).at[7, 7].set(finger_mass)
     return mass, jnp.concatenate([jnp.stack(motion.acceleration), finger_free, ring_free])
-
-
-def _solve6(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    factor = small.settle(small.cholesky([[matrix[i, j] for j in range(6)] for i in range(6)]))
-    return jnp.stack(small.solve(factor, [right[i] for i in range(6)]))

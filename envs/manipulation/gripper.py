@@ -16,7 +16,7 @@ RAMP = 0.01  # change of the command per physics step towards the sign of the ac
 COMMANDS = np.linspace(0.0, 0.8, 9)
 # joints at rest for these commands, nothing held, rad (measured in robosuite 1.4.1)
 KNUCKLE_REST = np.array([-0.0276, 0.0269, 0.0904, 0.1532, 0.2156, 0.2858, 0.3560, 0.4262, 0.5005])
-INNERFINGER_REST = np.array(
+INNER_FINGER_REST = np.array(
     [-0.276, -0.276, -0.272, -0.266, -0.263, -0.264, -0.260, -0.257, -0.238]
 )
 INNER_KNUCKLE_REST = np.array(
@@ -61,7 +61,7 @@ def following_rest(knuckle: jax.Array, squeeze: jax.Array) -> tuple[jax.Array, j
     )
     share = jnp.clip(squeeze / FULL_SQUEEZE, 0.0, 1.0)
     return (
-        _look_up(INNERFINGER_REST, control) + YIELD * share,
+        _look_up(INNER_FINGER_REST, control) + YIELD * share,
         _look_up(INNER_KNUCKLE_REST, control) + RISE * share,
     )
 

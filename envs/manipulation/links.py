@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.manipulation import small
 from envs.manipulation.arm import Frames
 
 # body (index into Frames.links; 6 is the hand), ends in its frame, radius, m
@@ -59,12 +60,12 @@ def arm_hits(
     for body, a, b, r in _CAPSULES:
         position, columns = at.links[body]
         origin = jnp.stack(position)
-        turn = jnp.stack([jnp.stack(column) for column in columns])  # rows are the axes
+        turn = small.array(columns)  # rows are the axes
         first.append(origin + jnp.array(a) @ turn)
         second.append(origin + jnp.array(b) @ turn)
         radius.append(r)
     site = jnp.stack(at.position)
-    turn = jnp.stack([jnp.stack(column) for column in at.rotation])
+    turn = small.array(at.rotation)
     first += [site + jnp.array(tool_ends[0]) @ turn, jnp.array(_MOUNT[0])]
     second += [site + jnp.array(tool_ends[1]) @ turn, jnp.array(_MOUNT[1])]
     p, q, r = jnp.stack(first), jnp.stack(second), np.array([*radius, _TOOL_RADIUS, _MOUNT[2]])

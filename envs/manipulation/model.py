@@ -12,11 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-CONTROL_STEP = 0.05  # s
-TIMESTEP = (
-    0.002  # s: robosuite's; at 5 ms the free arm strays 2 mm in a second, wiping 20 times more
-)
-SUBSTEPS = 25
+# robosuite's, s; at 5 ms the free arm strays 2 mm in a second, wiping 20 times more
+TIMESTEP = 0.002
+SUBSTEPS = 25  # per control step of 0.05 s
 
 INITIAL_JOINTS = np.array([-0.470, -1.735, 2.480, -2.275, -1.590, -1.991])
 INITIAL_NOISE = 0.02  # rad, standard deviation per joint

@@ -10,17 +10,18 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from envs.manipulation.model import PEG
+from envs.manipulation import small
+from envs.manipulation.model import GRIPPER, PEG
 from envs.manipulation.nut import (
     _BASE,
     PLACE_Z,
     NutParams,
     NutState,
     handle_of,
-    lagged_frames,
     lagged_ring,
     rotation_matrix,
 )
+from envs.manipulation.world import lagged_frames
 
 GAIN = 12.0  # 1/m, action per distance
 TURN = 2.0  # action per rad
@@ -46,9 +47,9 @@ def scripted_expert(
 ) -> jax.Array:
     """Action [7]: hover over the handle, descend, grasp, lift, carry, lower onto the peg."""
     del key, observation, params
-    at = lagged_frames(state)
+    at = lagged_frames(state, GRIPPER)
     eef = jnp.stack(at.position) + _BASE
-    axes = jnp.stack([jnp.stack(column) for column in at.rotation])  # rows
+    axes = small.array(at.rotation)  # rows
     position, quaternion = lagged_ring(state)
     ring = rotation_matrix(quaternion)
     handle = handle_of(position, quaternion)

@@ -70,7 +70,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
     spring = _STIFFNESS * d * reported
     # per joint, the acceleration field c + u px + w py of the face: [9, 6]
     fields = jax.lax.optimization_barrier(_fields(motion))
-    mass = jnp.stack([entry for row in motion.matrix for entry in row]).reshape(6, 6)
+    mass = small.array(motion.matrix)
     free = jnp.stack(motion.acceleration)
     speed = jnp.stack(motion.speeds)
 
@@ -86,8 +86,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
         moments = (force @ _BASIS[:3].T).T.reshape(9)
         matrix = mass + fields.T @ _spread(hessian @ _BASIS.T) @ fields
         residual = fields.T @ moments - mass @ (a - free)
-        factor = small.settle(small.cholesky([[matrix[i, j] for j in range(6)] for i in range(6)]))
-        return a + jnp.stack(small.solve(factor, [residual[i] for i in range(6)]))
+        return a + small.solve_array(matrix, residual)
 
     a = jnp.where(jnp.any(height < 0), start, free)
     for _ in range(ITERATIONS):
@@ -101,7 +100,7 @@ def _fields(motion: Motion) -> jax.Array:
         [*linear, *cross(angular, x_axis), *cross(angular, y_axis)]
         for linear, angular in motion.columns
     ]
-    return jnp.stack([entries[j][k] for k in range(9) for j in range(6)]).reshape(9, 6)
+    return small.array(zip(*entries, strict=True))
 
 
 # where entry (axis a of moment i, axis b of moment j) of the 9 x 9 form lies in the [6, 6] sums

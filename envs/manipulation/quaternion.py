@@ -15,7 +15,7 @@ _HALF_TURN = 0.5**0.5
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """A b."""
+    """The product a b: first b, then a."""
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],

@@ -1,4 +1,4 @@
-"""Linear algebra on lists of scalars, unrolled: six by six at most.
+"""Linear algebra on lists of scalars, unrolled: fourteen by fourteen at most.
 
 LAPACK calls inside a vectorised program are slow and, with few threads, have been seen to
 deadlock; unrolled, every entry is one vector over worlds.
@@ -74,13 +74,20 @@ def solve(factor: Rows, right: list[Scalar]) -> list[Scalar]:
     return backward(factor, forward(factor, right))
 
 
-def times(matrix: Rows, vector: list[Scalar]) -> list[Scalar]:
-    """Matrix vector."""
-    return [inner(row, vector) for row in matrix]
+def array(rows: Any) -> jax.Array:
+    """Nested scalars as an array: a matrix of its rows, or (columns given) its transpose."""
+    return jnp.stack([jnp.stack(list(row)) for row in rows])
+
+
+def solve_array(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """matrix^-1 right for a symmetric positive definite matrix [n, n] and right [n]."""
+    size = len(right)
+    factor = cholesky([[matrix[i, j] for j in range(size)] for i in range(size)])
+    return jnp.stack(solve(settle(factor), [right[i] for i in range(size)]))
 
 
 def inner(a: list[Scalar], b: list[Scalar]) -> Scalar:
-    """A . b."""
+    """The inner product a . b."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         total = total + x * y

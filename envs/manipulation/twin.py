@@ -60,6 +60,10 @@ def _turn(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
+def _single(value: Any) -> jax.Array:
+    return jnp.asarray(np.array(value), jnp.float32)  # a copy: MuJoCo goes on in its own
+
+
 class _Arm:
     """MuJoCo's model and data, and operational-space control on what they say."""
 
@@ -75,13 +79,20 @@ class _Arm:
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site("grip").id
 
-    def goal(self, action: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Controller's goal: position, and rotation with its axes as columns."""
+    def begin(
+        self, action: Any, held: jax.Array
+    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """The clipped action, and the controller's goal for it: position, rotation (columns).
+
+        `held` is the last goal's rotation, its axes as rows. MuJoCo's data is in the state.
+        """
+        action = np.clip(np.asarray(action, float), -1, 1)
+        self.mujoco.mj_forward(self.model, self.data)
         place = self.data.site_xpos[self.site] + POSITION_STEP * action[:3]
         if not np.any(action[3:6]):
-            return place, held
+            return action, (place, np.asarray(held, float).T)
         now = self.data.site_xmat[self.site].reshape(3, 3)
-        return place, _turn(ROTATION_STEP * action[3:6]) @ now
+        return action, (place, _turn(ROTATION_STEP * action[3:6]) @ now)
 
     def torque(self, goal: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Joint torques of `control.free_motion`, friction in the joints taken off."""
@@ -129,12 +140,10 @@ class WipingTwin(wiping.TableWiping):
     ) -> tuple[wiping.WipingState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key
+        self.place(state)
         arm = self.arm
         model, data, mujoco = arm.model, arm.data, arm.mujoco
-        action = np.clip(np.asarray(action, float), -1, 1)
-        self.place(state)
-        mujoco.mj_forward(model, data)
-        goal = arm.goal(action, np.asarray(state.goal_rotation, float).T)
+        _, goal = arm.begin(action, state.goal_rotation)
         for _ in range(SUBSTEPS):
             mujoco.mj_step1(model, data)
             data.qfrc_applied[:6] = arm.torque(goal)
@@ -146,7 +155,7 @@ class WipingTwin(wiping.TableWiping):
             frame = data.contact[index].frame.reshape(3, 3)
             push += force[:3] @ frame  # the wiper's point is the pair's second geom
         moved = (data.qpos[:6], data.qvel[:6], data.qacc[:6], goal[1].T, push)
-        return self._finish(state, *(jnp.asarray(part, jnp.float32) for part in moved), params)
+        return self._finish(state, *map(_single, moved), params)
 
 
 class NutTwin(nut.NutAssembly):
@@ -208,15 +217,13 @@ class NutTwin(nut.NutAssembly):
     ) -> tuple[nut.NutState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key
+        self.place(state)
         arm = self.arm
         model, data, mujoco = arm.model, arm.data, arm.mujoco
-        action = np.clip(np.asarray(action, float), -1, 1)
+        action, goal = arm.begin(action, state.goal_rotation)
         fingers = np.asarray(state.fingers, float).copy()
         speeds = np.asarray(state.finger_speeds, float).copy()
         dofs, ring, at = self._knuckles, self._ring, self._ring_at
-        self.place(state)
-        mujoco.mj_forward(model, data)
-        goal = arm.goal(action, np.asarray(state.goal_rotation, float).T)
         command, touching = float(state.command), False
         damp = gripper.STIFFNESS * gripper.LAG
         for _ in range(SUBSTEPS):
@@ -224,7 +231,8 @@ class NutTwin(nut.NutAssembly):
             self._pose_fingers(fingers[1::3])
             mujoco.mj_step1(model, data)
             data.qfrc_applied[:6] = arm.torque(goal)
-            rest = float(np.interp(0.4 + 0.4 * command, gripper.COMMANDS, gripper.KNUCKLE_REST))
+            target = gripper.command_to_control(command)
+            rest = float(np.interp(target, gripper.COMMANDS, gripper.KNUCKLE_REST))
             pull = rest - data.qpos[dofs] - TIMESTEP * data.qvel[dofs]
             data.qfrc_applied[dofs] = gripper.STIFFNESS * pull - damp * data.qvel[dofs]
             mujoco.mj_step2(model, data)
@@ -241,21 +249,18 @@ class NutTwin(nut.NutAssembly):
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, data.qpos[at + 3 : at + 7])
 
-        def single(value: Any) -> jax.Array:
-            return jnp.asarray(np.array(value), jnp.float32)
-
         moved = state.replace(
-            joints=single(data.qpos[:6]),
-            speeds=single(data.qvel[:6]),
-            goal_rotation=single(goal[1].T),
-            fingers=single(fingers),
-            finger_speeds=single(speeds),
-            command=single(command),
+            joints=_single(data.qpos[:6]),
+            speeds=_single(data.qvel[:6]),
+            goal_rotation=_single(goal[1].T),
+            fingers=_single(fingers),
+            finger_speeds=_single(speeds),
+            command=_single(command),
             touching=jnp.asarray(touching),
-            position=single(data.qpos[at : at + 3]),
-            quaternion=single(data.qpos[at + 3 : at + 7]),
-            velocity=single(data.qvel[ring : ring + 3]),
-            spin=single(turn.reshape(3, 3) @ data.qvel[ring + 3 : ring + 6]),
+            position=_single(data.qpos[at : at + 3]),
+            quaternion=_single(data.qpos[at + 3 : at + 7]),
+            velocity=_single(data.qvel[ring : ring + 3]),
+            spin=_single(turn.reshape(3, 3) @ data.qvel[ring + 3 : ring + 6]),
             time=state.time + 1,
         )
         return self._finish(state, moved, params)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Environment
 from envs.manipulation import control, small
 from envs.manipulation.arm import Frames, bias_torque, frames
 from envs.manipulation.links import arm_hits
@@ -26,6 +25,7 @@ from envs.manipulation.model import (
 )
 from envs.manipulation.pad import POINTS, press
 from envs.manipulation.quaternion import hand_quaternion
+from envs.manipulation.world import ArmWorld, lagged_frames
 from ppl_jax.types import Expert, Outcome, WorldSpec
 
 OBSERVATION_SIZE, ACTION_SIZE = 34, 6
@@ -105,22 +105,9 @@ class WipingParams:
     reward_scale: jax.Array | float = NORMALISATION
 
 
-def lagged_frames(state: WipingState) -> Frames:
-    """Kinematics one physics step ago: what robosuite observes and rewards.
-
-    MuJoCo's poses are those of the start of its last step; q - h dq is exactly that state.
-    """
-    joints = state.joints - TIMESTEP * state.speeds
-    return small.settle(frames(list(joints), WIPER))
-
-
 def gap_below(at: Frames) -> jax.Array:
     """Height of the wiper's face above the table, m."""
     return at.position[2] - _TABLE[2]
-
-
-def _matrix(columns: Any) -> jax.Array:
-    return jnp.stack([jnp.stack(list(column)) for column in columns])
 
 
 def contact_count(at: Frames, table: jax.Array) -> jax.Array:
@@ -184,7 +171,7 @@ def advance(
 
     carry = (state.joints, state.speeds, state.acceleration, jnp.zeros(3))
     joints, speeds, acceleration, force = jax.lax.scan(step, carry, None, length=SUBSTEPS)[0]
-    return joints, speeds, acceleration, _matrix(goal[1]), force
+    return joints, speeds, acceleration, small.array(goal[1]), force
 
 
 def reward_of(
@@ -236,16 +223,14 @@ SCALE = np.concatenate(
 ).astype(np.float32)  # fmt: skip
 
 
-class TableWiping(Environment):
+class TableWiping(ArmWorld):
     """Table wiping as pure functions. Build one with `make_table_wiping`."""
 
     name = "table_wiping"
     spec = WorldSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
     max_episode_steps = HORIZON
-
-    def __init__(self, default_params: WipingParams, held_out_params: WipingParams):
-        self.default_params = default_params
-        self.held_out_params = held_out_params
+    tool = WIPER
+    base = _BASE
 
     @property
     def scripted_expert(self) -> Expert:
@@ -253,14 +238,6 @@ class TableWiping(Environment):
         from envs.manipulation.wiping_expert import scripted_expert
 
         return scripted_expert
-
-    def scenario_numbers(self, params: WipingParams) -> jax.Array:
-        """Numbers of the pool's scenarios, [S]."""
-        return params.number
-
-    def scenario_count(self, params: WipingParams) -> int:
-        """Number of scenarios in the pool."""
-        return params.number.shape[0]
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: WipingParams) -> WipingState:
         """The start of scenario `index` of the pool."""
@@ -271,7 +248,7 @@ class TableWiping(Environment):
             joints=joints,
             speeds=jnp.zeros(6),
             acceleration=jnp.zeros(6),
-            goal_rotation=_matrix(at.rotation),
+            goal_rotation=small.array(at.rotation),
             force=jnp.zeros(3),
             force_bias=jnp.zeros(3),
             contact=jnp.zeros((), bool),
@@ -312,8 +289,8 @@ class TableWiping(Environment):
             acceleration=sound(acceleration, state.acceleration),
             goal_rotation=sound(goal_rotation, state.goal_rotation),
         )
-        at = lagged_frames(moved)
-        turn = _matrix(at.rotation)
+        at = lagged_frames(moved, WIPER)
+        turn = small.array(at.rotation)
         weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass])
         force = sound(-turn @ (push + weight), state.force)
         contact = jnp.linalg.norm(force - state.force_bias) > CONTACT_FORCE
@@ -358,10 +335,6 @@ class TableWiping(Environment):
             ),
             broken=broken,
         )
-
-    def grip_position(self, state: WipingState) -> jax.Array:
-        """Where the grip site is, [3] m in the world."""
-        return jnp.stack(lagged_frames(state).position) + _BASE
 
     def observe(self, state: WipingState, params: WipingParams) -> jax.Array:
         """The 34 values, in robosuite 1.4.1's order.

@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 
 from envs.manipulation.arm import cross
+from envs.manipulation.model import WIPER
 from envs.manipulation.wiping import (
     _BASE,
     WipingParams,
     WipingState,
     gap_below,
-    lagged_frames,
     remaining,
 )
+from envs.manipulation.world import lagged_frames
 
 GAIN = 15.0  # 1/m, action per distance
 INSIDE = 0.03  # m: the circle is that much smaller than the dirt's radius, half the wiper
@@ -50,7 +51,7 @@ def scripted_expert(
 ) -> jax.Array:
     """Action [6]: keep the wiper level and pressed, and circle what is left of the dirt."""
     del key, observation, params
-    at = lagged_frames(state)
+    at = lagged_frames(state, WIPER)
     place = jnp.stack(at.position)[:2] + _BASE[:2]
     _, radius, centroid = remaining(state.markers, state.wiped)
     away = place - centroid[:2]

@@ -69,7 +69,7 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
     def decide(
         state: PPLState, trajectory: Trajectory, experts: Trajectory | None, hparams: HParams
     ) -> jax.Array:
-        return rule(trajectory, experts, hparams)
+        return rule(trajectory, experts, hparams, spec.observation_scale)
 
     def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
         human = buffers.add(
