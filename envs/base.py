@@ -19,6 +19,7 @@ class Environment:
     name: str
     spec: WorldSpec
     max_episode_steps: int
+    one_by_one: bool = False
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: Any) -> Any:
         """The start of scenario `index`."""

@@ -155,7 +155,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
         return figures
     twin.place(state)
     arm = twin.arm
-    hold = arm.goal(np.zeros(6), np.asarray(state.goal_rotation, float).T)
+    _, hold = arm.begin(np.zeros(6), state.goal_rotation)
 
     def c_mujoco() -> None:
         for _ in range(SUBSTEPS * 10):

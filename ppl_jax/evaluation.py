@@ -38,6 +38,7 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
     `act` is called on one world at a time; it never sees anything of the expert. Episodes run in
     lock step until the last has ended.
     """
+    one_by_one = env.one_by_one and jax.default_backend() == "cpu"
 
     def evaluate(params: Any, key: jax.Array) -> Episodes:
         count = env.scenario_count(params)
@@ -53,10 +54,21 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
             action = act(key_act, state, env.observe(state, params), params)
             return env.transition(key_step, state, action, params)
 
+        def one_if(lane: Any) -> Any:
+            alive, key, state = lane
+            nothing = jax.tree.map(
+                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, key, state)[1]
+            )
+            return jax.lax.cond(alive, one, lambda _, state: (state, nothing), key, state)
+
         def step(carry: Any) -> Any:
             key, states, alive, so_far, time = carry
             key, key_step = jax.random.split(key)
-            states, out = jax.vmap(one)(jax.random.split(key_step, count), states)
+            keys = jax.random.split(key_step, count)
+            if one_by_one:
+                states, out = jax.lax.map(one_if, (alive, keys, states))
+            else:
+                states, out = jax.vmap(one)(keys, states)
             so_far = Episodes(
                 so_far.success | (alive & out.success),
                 so_far.episodic_return + alive * out.reward,

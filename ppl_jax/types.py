@@ -139,12 +139,15 @@ class Env(Protocol):
     """A world. All methods are pure; write for one world and `vmap` outside.
 
     `params` is a traced struct; `default_params` is for training, `held_out_params` for
-    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`.
+    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`. `one_by_one`:
+    on a CPU a batch of worlds is no faster than one after another, so that an evaluation had better
+    leave out those whose episode has ended.
     """
 
     name: str
     spec: WorldSpec
     max_episode_steps: int
+    one_by_one: bool
     default_params: PyTree
     held_out_params: PyTree
 

@@ -35,6 +35,15 @@ def cone_cost(residual: jax.Array, weight: jax.Array, friction: np.ndarray | flo
     return jnp.sum(jnp.where(stuck, held, jnp.where(gap < 0, 0.5 * middle * gap * gap, 0.0)))
 
 
+def cone_force(residual: jax.Array, weight: jax.Array, friction: np.ndarray | float) -> jax.Array:
+    """Force of the elliptic cones, [3, ..., P]; arguments as for `cone`, which gives it too."""
+    mu, slide, middle, gap, stuck = _zones(residual, weight, friction)
+    x, y, z = residual
+    fz = jnp.where(stuck, -weight * z, jnp.where(gap < 0, -middle * gap * mu, 0.0))
+    pull = jnp.where(stuck, -weight * IMPEDANCE_RATIO * slide, -friction * fz)
+    return jnp.stack([pull * x / slide, pull * y / slide, fz])
+
+
 def cone(
     residual: jax.Array, weight: jax.Array, friction: np.ndarray | float
 ) -> tuple[jax.Array, jax.Array]:
@@ -51,13 +60,10 @@ def cone(
     Returns:
         [3, P] force, and xx, xy, yy, xz, yz, zz of the second derivative, [6, P].
     """
-    x, y, z = residual
     mu, slide, middle, gap, stuck = _zones(residual, weight, friction)
-    tx, ty = x / slide, y / slide
+    tx, ty = residual[0] / slide, residual[1] / slide
     sliding = (gap < 0) & ~stuck
-    fz = jnp.where(stuck, -weight * z, jnp.where(sliding, -middle * gap * mu, 0.0))
     held = weight * IMPEDANCE_RATIO
-    pull = jnp.where(stuck, -held * slide, -friction * fz)
     steep = middle * mu * mu
     bent = -middle * gap * mu * friction / slide
 
@@ -72,4 +78,4 @@ def cone(
         both(0.0, -steep * friction * ty),
         both(weight, steep),
     ]
-    return jnp.stack([pull * tx, pull * ty, fz]), jnp.stack(hessian)
+    return cone_force(residual, weight, friction), jnp.stack(hessian)

@@ -9,14 +9,15 @@ handle's end and the finger tips on the table. As in MuJoCo with elliptic cones,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation import gripper, small
-from envs.manipulation.contact import cone, cone_cost
+from envs.manipulation.contact import cone, cone_cost, cone_force
 from envs.manipulation.control import Motion
 from envs.manipulation.model import (
     HANDLE,
@@ -34,10 +35,9 @@ from envs.manipulation.model import (
     TIMESTEP,
 )
 
-ITERATIONS = 3
-# of the pads on the handle: twice robosuite's, for the torsional friction and the further contact
-# points that its flat pads have there (with 1, one grasp in ten slips where the recorded holds)
-PAD_FRICTION, FRICTION = 2.0, 1.0
+ITERATIONS, CONVERGED = 8, 1e-4  # of Newton's method: at most, and the step's energy to stop at
+_TRIES = np.array([0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0], np.float32)  # shares of a step
+FRICTION = 1.0
 # of every contact: MuJoCo's solref 0.02 1 at an impedance between ring's and others'
 STIFF, DAMP, IMPEDANCE = 1 / (0.974 * 0.02) ** 2, 2 / (0.974 * 0.02), 0.96
 _DEEPEST = 0.005  # m: a point farther inside the handle came through another face
@@ -220,12 +220,64 @@ def hold(
     depth = jnp.maximum(-gap, 0.0)
     rest = DAMP * (rows @ speed)
     rest = rest.at[2].add(-STIFF * IMPEDANCE * depth)
-    flat = rows.reshape(-1, 14)
-    friction = np.where(np.arange(gap.shape[0]) < _PADS, PAD_FRICTION, FRICTION)
-    friction = friction.astype(np.float32)
 
-    def improve(a: jax.Array) -> jax.Array:
-        force, h = cone(rows @ a + rest, weight, friction)
+    def together() -> jax.Array:
+        def curvature(bent: jax.Array) -> jax.Array:
+            # the ring's own contacts do not touch the first eight columns
+            near, bent_near = rows[:, :carried, :8].reshape(-1, 8), bent[:, :carried]
+            by_mover = near.T @ bent_near.reshape(-1, 14)
+            by_ring = rows[:, :, 8:].reshape(-1, 6).T @ bent[:, :, 8:].reshape(-1, 6)
+            lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
+            return jnp.concatenate([by_mover, lower])
+
+        return _newton(rows, rest, weight, mass, free, start, curvature)
+
+    def apart() -> jax.Array:
+        own = rows[:, carried:, 8:]
+        alone = _newton(
+            own,
+            rest[:, carried:],
+            weight[carried:],
+            mass[8:, 8:],
+            free[8:],
+            start[8:],
+            lambda bent: own.reshape(-1, 6).T @ bent.reshape(-1, 6),
+        )
+        return jnp.concatenate([free[:8], alone])
+
+    # where no finger touches anything, the ring is alone with table and peg
+    a = jax.lax.cond(jnp.any(gap[:carried] < 0), together, apart)
+    force, _ = cone(rows @ a + rest, weight, FRICTION)
+    squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
+    touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
+    return Held(a, jnp.sum(squeeze, -1), touching)
+
+
+def _newton(
+    rows: jax.Array,
+    rest: jax.Array,
+    weight: jax.Array,
+    mass: jax.Array,
+    free: jax.Array,
+    start: jax.Array,
+    curvature: Callable[[jax.Array], jax.Array],
+) -> jax.Array:
+    """Minimise 1/2 (a - free)' M (a - free) + cones(rows a + rest) from the better of two starts.
+
+    Args:
+        rows: [3, C, N] Jacobian. rest: [3, C] what the residual is without acceleration.
+        weight: [C].
+        mass: [N, N]. free, start: [N] acceleration without contact, and the last step's.
+        curvature: `curvature(bent [3, C, N]) -> rows' bent [N, N]`.
+    """
+
+    def cost(a: jax.Array) -> jax.Array:
+        off = a - free
+        return 0.5 * off @ mass @ off + cone_cost(rows @ a + rest, weight, FRICTION)
+
+    def improve(carry: tuple[jax.Array, jax.Array, jax.Array]) -> Any:
+        a, _, count = carry
+        force, h = cone(rows @ a + rest, weight, FRICTION)
         bent = jnp.stack(
             [
                 h[0][:, None] * rows[0] + h[1][:, None] * rows[1] + h[3][:, None] * rows[2],
@@ -233,32 +285,31 @@ def hold(
                 h[3][:, None] * rows[0] + h[4][:, None] * rows[1] + h[5][:, None] * rows[2],
             ]
         )
-        # the ring's own contacts do not touch the first eight columns
-        near, bent_near = rows[:, :carried, :8].reshape(-1, 8), bent[:, :carried].reshape(-1, 14)
-        by_mover = near.T @ bent_near
-        by_ring = rows[:, :, 8:].reshape(-1, 6).T @ bent[:, :, 8:].reshape(-1, 6)
-        lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
-        matrix = mass + jnp.concatenate([by_mover, lower])
+        flat = rows.reshape(-1, rows.shape[-1])
         residual = flat.T @ force.reshape(-1) - mass @ (a - free)
-        return a + small.solve_array(matrix, residual)
+        move = small.solve_array(mass + curvature(bent), residual)
+        energy = move @ residual
+        # where contacts come or go, or begin to slide, Newton's step overshoots: the cost is
+        # convex, so that its slope along the step has one zero, between two of the tries
+        along = rows @ move
+        there = (rows @ a + rest)[:, None] + _TRIES[:, None] * along[:, None]  # [3, K, C]
+        pulled = jnp.sum(cone_force(there, weight, FRICTION) * along[:, None], (0, 2))
+        bend = mass @ move
+        slope = (a - free) @ bend + _TRIES * (move @ bend) - pulled
+        ends = jnp.concatenate([-energy[None], slope])
+        last = jnp.sum(slope < 0)  # the interval's lower end
+        share = jnp.append(0.0, _TRIES)
+        low, high = ends[last], ends[jnp.minimum(last + 1, len(_TRIES))]
+        width = share[jnp.minimum(last + 1, len(_TRIES))] - share[last]
+        step = share[last] + width * low / jnp.minimum(low - high, -1e-12)
+        return a + step * move, energy, count + 1
 
-    def cost(a: jax.Array) -> jax.Array:
-        off = a - free
-        return 0.5 * off @ mass @ off + cone_cost(rows @ a + rest, weight, friction)
+    def unsettled(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        return (carry[1] > CONVERGED) & (carry[2] < ITERATIONS)
 
-    def iterate(_: jax.Array, a: jax.Array) -> jax.Array:
-        new = improve(a)
-        # Newton's step may overshoot where a contact comes or goes: half of it is tried as well
-        half = 0.5 * (a + new)
-        return jnp.where(cost(half) < cost(new), half, new)
-
-    # a loop, not a copy per iteration: the compiler's time is most of what a newcomer waits for
     a = jnp.where(cost(start) < cost(free), start, free)
-    a = jax.lax.fori_loop(0, ITERATIONS, iterate, a)
-    force, _ = cone(rows @ a + rest, weight, friction)
-    squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
-    touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
-    return Held(a, jnp.sum(squeeze, -1), touching)
+    begin = (a, jnp.full((), jnp.inf), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(unsettled, improve, begin)[0]
 
 
 def _inertia(

@@ -237,9 +237,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
     return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
-def nut_scene(
-    beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, frictions: tuple[float, float]
-) -> str:
+def nut_scene(beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, friction: float) -> str:
     """MJCF of nut assembly.
 
     The inner fingers are fixed to the knuckles here; `twin.py` turns them, and moves the pads'
@@ -249,7 +247,7 @@ def nut_scene(
         beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
         pads: Number of contact points on each pad.
         soft: solref and solimp, as MJCF attributes.
-        frictions: Of the pads on the handle, and of everything else.
+        friction: Of all contacts.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""
@@ -296,19 +294,20 @@ def nut_scene(
   rgba=".25 .65 .35 1"/>
 <geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
   rgba=".6 .62 .65 1"/>"""
-    grip, other = frictions
     pairs = "".join(
-        _pair(f"{side}_{i}", f"{side}_{i}", "handle", grip, soft)
+        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction, soft)
         for side in ("left", "right")
         for i in range(pads)
     )
     pairs += "".join(
-        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", other, soft)
+        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction, soft)
         for side in ("left", "right")
         for i in (0, pads // 2)
     )
     pairs += "".join(
-        _pair(f"foot_{i}", "table", f"foot_{i}", other, soft) for i in range(len(feet))
+        _pair(f"foot_{i}", "table", f"foot_{i}", friction, soft) for i in range(len(feet))
     )
-    pairs += "".join(_pair(f"bead_{i}", f"bead_{i}", "peg", other, soft) for i in range(len(beads)))
+    pairs += "".join(
+        _pair(f"bead_{i}", f"bead_{i}", "peg", friction, soft) for i in range(len(beads))
+    )
     return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)

@@ -122,7 +122,17 @@ def handle_of(position: jax.Array, quaternion: jax.Array) -> jax.Array:
 
 
 def advance(state: NutState, action: jax.Array) -> NutState:
-    """One control step of the physics: 25 steps of 2 ms; time and contact flag included."""
+    """One control step of the physics: 25 steps of 2 ms; time and contact flag included.
+
+    On a CPU a batch goes one world after another: the contact solver is as fast with one as with
+    many, and then stops in each world as soon as it has converged.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.custom_batching.sequential_vmap(_advance)(state, action)
+    return _advance(state, action)
+
+
+def _advance(state: NutState, action: jax.Array) -> NutState:
     at = small.settle(frames(list(state.joints), GRIPPER))
     action = jnp.clip(action, -1.0, 1.0)
     held = tuple(tuple(row) for row in state.goal_rotation)

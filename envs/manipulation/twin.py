@@ -47,7 +47,7 @@ def nut_xml() -> str:
         grasp.FEET,
         2 * len(gripper.PAD_ROWS),
         soft,
-        (grasp.PAD_FRICTION, grasp.FRICTION),
+        grasp.FRICTION,
     )
 
 

@@ -25,6 +25,7 @@ class ArmWorld(Environment):
 
     tool: Tool
     base: np.ndarray
+    one_by_one = True
 
     def __init__(self, default_params: Any, held_out_params: Any):
         self.default_params = default_params
