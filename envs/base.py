@@ -13,7 +13,7 @@ from ppl_jax.types import Outcome, StepInfo, WorldSpec
 class Environment:
     """Base class of worlds: fill in `reset_to`, `transition`, `observe`, `scenario_count`.
 
-    The shape is gymnax 1.0's. See `ppl_jax.types.Env` for the methods' contracts.
+    The shape is gymnax 1.0's. See `ppl_jax.types.Env` for the methods' contracts and attributes.
     """
 
     name: str

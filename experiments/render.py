@@ -64,11 +64,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
     config, hparams = default(env.name)
-    rule, key, scale = (
-        RULES[config.gate],
-        jax.random.key(0),
-        jnp.asarray(env.spec.observation_scale),
-    )
+    rule, key = RULES[config.gate], jax.random.key(0)
     state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
     if env.name == "driving":
         place, picture = _driving(env, state)
@@ -91,9 +87,10 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
         action = act(key, state, env.observe(state, params), params)
         trajectory = predict(env, env.transition, key, state, action, params, horizon)
         after, outcome = env.transition(key, state, action, params)
+        takeover = rule(trajectory, None, hparams, env.spec.observation_scale)
         novice = positions(state, act, held=True)
         expert = positions(state, env.scripted_expert, held=False)
-        return after, outcome, novice, rule(trajectory, None, hparams, scale), expert
+        return after, outcome, novice, takeover, expert
 
     frames = []
     for t in range(steps):

@@ -177,6 +177,7 @@ _NOT_NEGATIVE = (
     "prediction_noise",
     "expert_noise",
     "learning_rate",
+    "max_departure",
 )
 
 

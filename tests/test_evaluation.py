@@ -33,8 +33,10 @@ def test_evaluation_is_a_loop_over_scenarios(world):
         np.testing.assert_allclose(found.progress[i], out.progress, atol=1e-3)
 
 
-def test_the_answer_is_known_on_the_probe():
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_the_answer_is_known_on_the_probe(one_by_one):
     probe = Probe()
+    probe.one_by_one = one_by_one
     params = probe.held_out_params
     good = evaluate(probe, lambda k, s, o, p: jnp.array([0.6]) * o[0], params, jax.random.key(0))
     bad = evaluate(probe, lambda k, s, o, p: jnp.array([0.6]), params, jax.random.key(0))
@@ -45,6 +47,24 @@ def test_the_answer_is_known_on_the_probe():
     rows = rows_of(bad, probe.scenario_numbers(params), 7)
     assert [row.success for row in rows] == [1, 0]
     assert rows[0].step == 7
+
+
+def test_one_by_one_leaves_out_ended_episodes():
+    calls = []
+
+    class Counting(Probe):
+        one_by_one = True
+
+        def transition(self, key, state, action, params):
+            jax.debug.callback(lambda *_: calls.append(1), state.time)
+            return super().transition(key, state, action, params)
+
+    probe = Counting()
+    found = evaluate(
+        probe, lambda k, s, o, p: jnp.array([0.6]), probe.held_out_params, jax.random.key(0)
+    )
+    jax.effects_barrier()
+    assert len(calls) == int(jnp.sum(found.length)) < 2 * int(jnp.max(found.length))
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4"])
