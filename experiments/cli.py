@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, subcommand
 
+from envs.compiler import set_xla_flags
 from experiments.runtime import UserError
 
 
@@ -301,6 +302,7 @@ _ACTIONS = {
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
+    set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
     command = tyro.cli(Command, prog="ppl", args=argv, description=__doc__)
     try:
         _ACTIONS[type(command)](command)

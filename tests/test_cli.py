@@ -263,3 +263,19 @@ def test_importing_the_package_does_not_load_the_heavy_libraries():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_importing_anything_does_not_start_jax():
+    """XLA reads its flags once: a module that makes an array while imported loses them."""
+    code = """
+import importlib, pkgutil
+import jax._src.xla_bridge as bridge
+import envs, experiments, ppl_jax
+for package in (envs, experiments, ppl_jax):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if module.name.endswith("fidelity"):
+            continue  # programs of their own
+        importlib.import_module(module.name)
+        assert not bridge.backends_are_initialized(), module.name
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

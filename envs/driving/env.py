@@ -10,6 +10,7 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Environment
 from envs.driving import navigation as nav
@@ -43,7 +44,7 @@ HELD_OUT_SCENARIOS = range(1000, 1050)
 HORIZON = 1500  # steps of 0.1 s
 CONTACT_MARGIN = 0.04  # m: closer than this counts as touching, as in the simulator
 _COASTING = 0.364  # m/s^2: 4 wheels, 2 N s per 0.02 s, 1100 kg
-_HALF = jnp.array(vehicle.HALF_SIZE, jnp.float32)
+_HALF = np.array(vehicle.HALF_SIZE, np.float32)
 
 
 @flax.struct.dataclass

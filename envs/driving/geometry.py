@@ -110,7 +110,9 @@ def on_lanes(lanes: Lanes, long: jax.Array, lateral: jax.Array) -> jax.Array:
     )
 
 
-_OUTLINE = jnp.array([[1.0, 1.0], [1.0, -1.0], [0.0, 1.0], [0.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+_OUTLINE = np.array(
+    [[1.0, 1.0], [1.0, -1.0], [0.0, 1.0], [0.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], np.float32
+)
 
 
 def touches_sidewalk(lanes: Lanes, kerbs: jax.Array, pose: jax.Array, half: jax.Array) -> jax.Array:
