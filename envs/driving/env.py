@@ -139,7 +139,7 @@ def contacts(
     objects = scenario.objects
     boxes = jnp.concatenate([jnp.where(present[:, None], traffic_pose, 1e6), box_pose])
     half = jnp.concatenate([scenario.traffic.half, objects.box_half])
-    depth, out = box_contact(pose, _HALF, boxes, half)
+    depth, out = box_contact(pose, jnp.asarray(_HALF), boxes, half)
     n = present.shape[0]
     hit, hit_box = depth[:n] > -CONTACT_MARGIN, depth[n:] > -CONTACT_MARGIN
     hit_circle = circle_depth(pose, _HALF, objects.circle) > -CONTACT_MARGIN
