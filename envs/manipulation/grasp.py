@@ -247,7 +247,7 @@ def hold(
 
     # where no finger touches anything, the ring is alone with table and peg
     a = jax.lax.cond(jnp.any(gap[:carried] < 0), together, apart)
-    force, _ = cone(rows @ a + rest, weight, FRICTION)
+    force = cone_force(rows @ a + rest, weight, FRICTION)
     squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
     touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
     return Held(a, jnp.sum(squeeze, -1), touching)
@@ -277,7 +277,8 @@ def _newton(
 
     def improve(carry: tuple[jax.Array, jax.Array, jax.Array]) -> Any:
         a, _, count = carry
-        force, h = cone(rows @ a + rest, weight, FRICTION)
+        at = rows @ a + rest
+        force, h = cone(at, weight, FRICTION)
         bent = jnp.stack(
             [
                 h[0][:, None] * rows[0] + h[1][:, None] * rows[1] + h[3][:, None] * rows[2],
@@ -292,16 +293,16 @@ def _newton(
         # where contacts come or go, or begin to slide, Newton's step overshoots: the cost is
         # convex, so that its slope along the step has one zero, between two of the tries
         along = rows @ move
-        there = (rows @ a + rest)[:, None] + _TRIES[:, None] * along[:, None]  # [3, K, C]
+        there = at[:, None] + _TRIES[:, None] * along[:, None]  # [3, K, C]
         pulled = jnp.sum(cone_force(there, weight, FRICTION) * along[:, None], (0, 2))
         bend = mass @ move
         slope = (a - free) @ bend + _TRIES * (move @ bend) - pulled
         ends = jnp.concatenate([-energy[None], slope])
-        last = jnp.sum(slope < 0)  # the interval's lower end
         share = jnp.append(0.0, _TRIES)
-        low, high = ends[last], ends[jnp.minimum(last + 1, len(_TRIES))]
-        width = share[jnp.minimum(last + 1, len(_TRIES))] - share[last]
-        step = share[last] + width * low / jnp.minimum(low - high, -1e-12)
+        last = jnp.sum(slope < 0)  # the interval's lower end
+        after = jnp.minimum(last + 1, len(_TRIES))
+        low, high = ends[last], ends[after]
+        step = share[last] + (share[after] - share[last]) * low / jnp.minimum(low - high, -1e-12)
         return a + step * move, energy, count + 1
 
     def unsettled(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:

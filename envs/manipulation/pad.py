@@ -19,7 +19,7 @@ import numpy as np
 
 from envs.manipulation import small
 from envs.manipulation.arm import cross
-from envs.manipulation.contact import cone, impedance
+from envs.manipulation.contact import cone, cone_force, impedance
 from envs.manipulation.control import Motion
 
 # Contact of one point. MuJoCo 2.3.7 reports half of the true depth for a box that lies flat on
@@ -91,7 +91,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
     a = jnp.where(jnp.any(height < 0), start, free)
     for _ in range(ITERATIONS):
         a = jax.lax.optimization_barrier(improve(a))
-    return Touch(a, jnp.sum(cone(rows(a) + rest, weight, FRICTION)[0], -1))
+    return Touch(a, jnp.sum(cone_force(rows(a) + rest, weight, FRICTION), -1))
 
 
 def _fields(motion: Motion) -> jax.Array:
