@@ -22,13 +22,18 @@ class Train:
     env: Positional[str]
     """World: driving, table_wiping or nut_assembly."""
     algorithm: str = "ppl"
-    """Method: ppl, or bc_only (PPL without its preference loss)."""
+    """Method: ppl, bc, gail, hg_dagger, ensemble_dagger, thrifty_dagger, iwr, eil, haco, pvp; or
+    a port: haco_port, pvp4real."""
     seed: int = 0
     """Random seed."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from: ours, the paper's to the letter, or the released code's."""
     total_steps: int | None = None
-    """Environment steps."""
+    """Environment steps, demonstrations included."""
+    demonstrations: int | None = None
+    """Steps at the start that the expert makes all by itself."""
+    offline_updates: int | None = None
+    """Updates on them before the novice makes its first step."""
     preference_horizon: int | None = None
     """L: predicted states that get a preference pair."""
     prediction_horizon: int | None = None
@@ -43,6 +48,16 @@ class Train:
     """Factor on the rejected action's likelihood: 1 in the paper, 0.5 by default."""
     likelihood: Literal["gaussian", "laplace"] | None = None
     """Which log pi the losses mean."""
+    objective: Literal["cpo", "dpo", "ipo", "slic_hf", "imitation"] | None = None
+    """What is minimised on preference pairs."""
+    objective_target: Literal["pair", "library"] | None = None
+    """Margin of ipo and slic_hf: one that bounded actions can reach, or the libraries' constant."""
+    preferred: Literal["expert", "random"] | None = None
+    """Preferred actions of the pairs."""
+    rejected: Literal["novice", "random"] | None = None
+    """Rejected actions of the pairs."""
+    reference_policy: str | None = None
+    """Policy file (.npz): the reference of dpo and ipo."""
     prediction_noise: float | None = None
     """epsilon: noise of norm epsilon |s| on predicted states."""
     expert_noise: float | None = None
@@ -57,6 +72,28 @@ class Train:
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
     """Gate departs: how far from the expert's own path, in the world's units."""
+    discount: float | None = None
+    """gamma, of methods with action values."""
+    target_rate: float | None = None
+    """tau of target networks."""
+    margin: float | None = None
+    """EIL: hinge margins."""
+    conservative_weight: float | None = None
+    """HACO: weight of raising the expert's values over the novice's."""
+    max_doubt: float | None = None
+    """Ensemble-DAgger: variance of the members above which the expert acts."""
+    max_discrepancy: float | None = None
+    """Ensemble-DAgger: squared distance from the expert's action above which the expert acts."""
+    switch_rate: float | None = None
+    """Thrifty-DAgger: share of the novice's states that each test is to hand to the expert."""
+    discriminator_rate: float | None = None
+    """GAIL: learning rate of the discriminator."""
+    survival_correction: float | None = None
+    """GAIL: 1 for the reward log D - log(1 - D), 0 for -log(1 - D)."""
+    members: int | None = None
+    """Policies of an ensemble."""
+    rollout_steps: int | None = None
+    """GAIL: steps between updates."""
     batch_size: int | None = None
     """Samples per loss and update."""
     predictor: Literal["simulator", "kinematic"] | None = None
@@ -89,16 +126,16 @@ class Evaluate:
 
 @dataclasses.dataclass
 class Compare:
-    """Train several methods with the same seeds; one table."""
+    """Train all methods with the same seeds; one table."""
 
     env: Positional[str]
     """World: driving, table_wiping or nut_assembly."""
-    algorithms: tuple[str, ...] = ("ppl", "bc_only")
-    """Methods."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: all)."""
     seeds: int = 5
     """Seeds 0, 1, ..., each method the same."""
     total_steps: int | None = None
-    """Environment steps of each run."""
+    """Environment steps of each run (bc and gail keep their own)."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
     gate: Literal["unsafe_or_slow", "low_return", "departs"] | None = None
@@ -107,6 +144,8 @@ class Compare:
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
     """Gate departs: how far from the expert's own path, in the world's units."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
     scenarios: str | None = None
@@ -116,6 +155,30 @@ class Compare:
     processes: int = 2
     """Runs at the same time."""
     out: Path = Path("compare")
+    """Folder of the runs and of results.csv; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Ablation:
+    """Train the ten rows of the paper's ablation with the same seeds; one table."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    seeds: int = 5
+    """Seeds 0, 1, ..., each row the same."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    reference_steps: int = 10_000
+    """Expert steps that the reference policy of DPO and IPO clones."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
+    processes: int = 2
+    """Runs at the same time."""
+    out: Path = Path("ablation")
     """Folder of the runs and of results.csv; finished runs in it are kept."""
 
 
@@ -164,6 +227,7 @@ Command = (
     Annotated[Train, subcommand("train")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Compare, subcommand("compare")]
+    | Annotated[Ablation, subcommand("ablation")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Bench, subcommand("bench")]
@@ -174,16 +238,20 @@ Command = (
 def run_settings(command: Train):
     """Turn the command line into settings of a run."""
     from experiments.train import RunSettings
-    from ppl_jax.config import PRESETS
+    from ppl_jax.algorithms import settings
 
     try:
-        config, hparams = PRESETS[command.preset](command.env)
+        config, hparams = settings(command.algorithm, command.env, command.preset)
     except ValueError as error:
         raise UserError(str(error)) from error
     given = {
         name: value for name, value in dataclasses.asdict(command).items() if value is not None
     }
     static = {f.name: given[f.name] for f in dataclasses.fields(config) if f.name in given}
+    if "total_steps" in static and "demonstrations" not in static:
+        static["demonstrations"] = min(config.demonstrations, max(static["total_steps"], 0))
+        if not static["demonstrations"]:
+            static.setdefault("offline_updates", 0)
     if "prediction_horizon" in static:
         static["max_preference_horizon"] = max(
             1, min(config.max_preference_horizon, static["prediction_horizon"])
@@ -201,6 +269,7 @@ def run_settings(command: Train):
         config=final,
         hparams=hparams.replace(**traced),
         expert=command.expert,
+        reference_policy=command.reference_policy,
         scenarios=command.scenarios,
         held_out_scenarios=command.held_out_scenarios,
         evaluate_every=(
@@ -210,8 +279,9 @@ def run_settings(command: Train):
 
 
 def default_interval(config) -> int:
-    """A tenth of the run, whole decisions."""
-    return max(config.total_steps // 10 // config.decision_interval, 1) * config.decision_interval
+    """A tenth of what follows the demonstrations, in whole decisions."""
+    steps = config.total_steps - config.demonstrations
+    return max(steps // 10 // config.decision_interval, 1) * config.decision_interval
 
 
 def _train(command: Train) -> None:
@@ -248,11 +318,25 @@ def _evaluate(command: Evaluate) -> None:
 
 
 def _compare(command: Compare) -> None:
+    from experiments import paper
     from experiments.compare import compare
     from experiments.tables import print_comparison
 
-    compare(command)
-    print_comparison(command.out / "results.csv")
+    try:
+        compare(command)
+    finally:
+        print_comparison(command.out / "results.csv", paper.METHODS.get(command.env, {}))
+
+
+def _ablation(command: Ablation) -> None:
+    from experiments import paper
+    from experiments.ablation import ablation
+    from experiments.tables import print_comparison
+
+    try:
+        ablation(command)
+    finally:
+        print_comparison(command.out / "results.csv", paper.ABLATION)
 
 
 def _export(command: Export) -> None:
@@ -293,6 +377,7 @@ _ACTIONS = {
     Train: _train,
     Evaluate: _evaluate,
     Compare: _compare,
+    Ablation: _ablation,
     Export: _export,
     Render: _render,
     Bench: _bench,

@@ -1,21 +1,41 @@
-"""Several methods with the same seeds, as run folders, and one long results.csv."""
+"""Many runs side by side: all methods, or all ablations, as run folders and one results.csv."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.progress import Progress
 from experiments.runtime import UserError
 from experiments.tables import write_rows
-from ppl_jax.algorithms import ALGORITHMS
 from ppl_jax.runlog import CONFIG, EVALUATION, SUMMARY, RunFolder
 
 if TYPE_CHECKING:
-    from experiments.cli import Compare
+    from experiments.cli import Ablation, Compare
+
+OPTIONS = ("preset", "evaluate_every", "gate", "min_return", "max_departure", "batch_size")
+OPTIONS += ("scenarios", "held_out_scenarios")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One row of a comparison.
+
+    Attributes:
+        label: As in the table and in results.csv.
+        folder: Its runs are FOLDER-SEED.
+        words: Of its command line beside environment, seed and folder.
+    """
+
+    label: str
+    folder: str
+    words: tuple[str, ...]
 
 
 def compare(command: Compare) -> None:
@@ -26,76 +46,102 @@ def compare(command: Compare) -> None:
     Raises:
         UserError: If a method is unknown or a run failed (the others go on).
     """
-    for algorithm in command.algorithms:
-        if algorithm not in ALGORITHMS:
-            raise UserError(
-                f"unknown algorithm {algorithm!r}: choose one of {', '.join(ALGORITHMS)}"
-            )
+    from ppl_jax import algorithms
+
+    names = command.algorithms or tuple(algorithms.registered(variants=False))
+    rows = []
+    for name in names:
+        try:
+            changes = algorithms.method(name).changes(command.env)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        words = ["--algorithm", name]
+        # demonstrations are a method's own budget; the comparison's is that of the others
+        if command.total_steps is not None and "total_steps" not in changes:
+            words += ["--total-steps", str(command.total_steps)]
+        rows.append(Row(name, name, tuple(words)))
+    run_rows(command, rows)
+
+
+def run_rows(command: Compare | Ablation, rows: Sequence[Row]) -> None:
+    """Train every row with every seed and write results.csv of what has finished.
+
+    Raises:
+        UserError: If a setting is wrong or a run failed (the others go on).
+    """
     for name in ("seeds", "processes"):
         if getattr(command, name) < 1:
             raise UserError(f"{name} must be at least 1, got {getattr(command, name)}")
-    waiting = [
-        (algorithm, seed) for seed in range(command.seeds) for algorithm in command.algorithms
-    ]
-    running: dict[tuple[str, int], subprocess.Popen] = {}
+    jobs = [(row, seed) for seed in range(command.seeds) for row in rows]
+    waiting = [job for job in jobs if not (_run(command, *job) / SUMMARY).is_file()]
+    running: dict[tuple[Row, int], subprocess.Popen] = {}
     failed = []
-    while waiting or running:
-        while waiting and len(running) < command.processes:
-            job = waiting.pop(0)
-            run = command.out / f"{job[0]}-{job[1]}"
-            if not (run / SUMMARY).is_file():
-                running[job] = _start(command, job, run)
-        for job, process in list(running.items()):
-            if process.poll() is not None:
+    done = len(jobs) - len(waiting)
+    with Progress(len(jobs), f"runs on {command.env}", done) as progress:
+        progress.start()
+        while waiting or running:
+            while waiting and len(running) < command.processes:
+                job = waiting.pop(0)
+                running[job] = _start(command, *job)
+            for job, process in list(running.items()):
+                if process.poll() is None:
+                    continue
                 del running[job]
-                print(f"{job[0]} seed {job[1]}: {'done' if not process.returncode else 'FAILED'}")
+                done += 1
+                row, seed = job
                 if process.returncode:
-                    failed.append(f"{job[0]}-{job[1]}")
-        time.sleep(0.2)
-    write_rows(command.out / "results.csv", _collect(command))
+                    failed.append(_run(command, *job).name)
+                    _tell(_run(command, *job).with_suffix(".log"))
+                state = "FAILED" if process.returncode else "done"
+                progress.update(done, f"{row.label} seed {seed} {state}")
+            time.sleep(0.2)
+    found = _collect(command, rows)
+    if found:
+        write_rows(command.out / "results.csv", found)
     if failed:
-        raise UserError(f"these runs failed, see their output above: {', '.join(failed)}")
+        raise UserError(
+            f"these runs failed ({len(jobs) - len(failed)} of {len(jobs)} are there; the same "
+            f"command tries them again): {', '.join(failed)}"
+        )
 
 
-def _start(command: Compare, job: tuple[str, int], run: Path) -> subprocess.Popen:
-    words = [
-        sys.executable,
-        "-m",
-        "experiments.cli",
-        "train",
-        command.env,
-        "--algorithm",
-        job[0],
-        "--seed",
-        str(job[1]),
-        "--out",
-        str(run),
-    ]
-    names = ("preset", "total_steps", "evaluate_every", "gate", "min_return", "max_departure")
-    names += ("scenarios", "held_out_scenarios")
-    for name in names:
-        value = getattr(command, name)
+def _run(command: Compare | Ablation, row: Row, seed: int) -> Path:
+    return command.out / f"{row.folder}-{seed}"
+
+
+def _tell(log: Path) -> None:
+    lines = log.read_text().strip().splitlines()
+    print(lines[-1] if lines else f"no output in {log}", file=sys.stderr)
+
+
+def _start(command: Compare | Ablation, row: Row, seed: int) -> subprocess.Popen:
+    run = _run(command, row, seed)
+    # the program that was called: it may have registered methods or worlds of its own
+    words = [sys.executable, sys.argv[0], "train", command.env, *row.words]
+    words += ["--seed", str(seed), "--out", str(run)]
+    for name in OPTIONS:
+        value = getattr(command, name, None)
         if value is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]
     if (run / CONFIG).exists():
         words.append("--resume")
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    command.out.mkdir(parents=True, exist_ok=True)
+    with open(run.with_suffix(".log"), "w") as log:
+        return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=log)
 
 
-def _collect(command: Compare) -> list[dict]:
+def _collect(command: Compare | Ablation, rows: Sequence[Row]) -> list[dict]:
     """One row per method, seed, evaluation and scenario."""
-    rows = []
-    for algorithm in command.algorithms:
+    found = []
+    for row in rows:
         for seed in range(command.seeds):
-            run = RunFolder(command.out / f"{algorithm}-{seed}")
+            run = RunFolder(_run(command, row, seed))
             if not (run.path / SUMMARY).is_file():
                 continue
-            hparams = run.config()["hparams"]
+            total = run.read_json(SUMMARY)["total_steps"]
             with open(run.path / EVALUATION, newline="") as file:
-                rows += [
-                    {"algorithm": algorithm, "seed": seed}
-                    | {name: f"{value:g}" for name, value in hparams.items()}
-                    | row
-                    for row in csv.DictReader(file)
+                found += [
+                    {"algorithm": row.label, "seed": seed, "total_steps": total, **line}
+                    for line in csv.DictReader(file)
                 ]
-    return rows
+    return found

@@ -45,12 +45,19 @@ def _episodes(env: Env, arrays: Any, activation: str, output: str, params: Any, 
     return make_evaluate(env, act)(params, key)
 
 
-def evaluate_policy(env: Env, policy: SavedPolicy, step: int) -> list[EvaluationRow]:
-    """Play every held-out scenario of `env` once, without the expert."""
-    arrays = jax.tree.map(
+def arrays_of(policy: SavedPolicy) -> SavedPolicy:
+    """A policy's numbers as float32 arrays of JAX."""
+    weights, mean, scale = jax.tree.map(
         lambda leaf: jnp.asarray(leaf, jnp.float32),
         (list(policy.weights), policy.obs_mean, policy.obs_scale),
     )
+    return policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
+
+
+def evaluate_policy(env: Env, policy: SavedPolicy, step: int) -> list[EvaluationRow]:
+    """Play every held-out scenario of `env` once, without the expert."""
+    policy = arrays_of(policy)
+    arrays = (policy.weights, policy.obs_mean, policy.obs_scale)
     params = env.held_out_params
     episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
     return rows_of(episodes, env.scenario_numbers(params), step)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.evaluate import EvaluationRow, read_evaluation, summarise_episodes
+from experiments.paper import Reported
 from ppl_jax.runlog import SUMMARY, RunFolder
 from ppl_jax.statistics import Interval, mean_interval, paired_difference
 
@@ -95,47 +96,72 @@ def show(interval: Interval, digits: int) -> str:
     return f"{interval.mean:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
 
 
-def print_comparison(path: Path) -> None:
-    """Methods side by side at their last evaluation, 95% intervals over seeds and scenarios."""
+def read_comparison(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Each method's last evaluation: columns as [seeds, scenarios]."""
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
-    last = max(int(row["step"]) for row in rows)
-    rows = [row for row in rows if int(row["step"]) == last]
-    algorithms = list(dict.fromkeys(row["algorithm"] for row in rows))
-    rng = np.random.default_rng(0)
-
-    def scores(algorithm: str, column: str) -> np.ndarray:
-        mine = [row for row in rows if row["algorithm"] == algorithm]
+    found = {}
+    for label in dict.fromkeys(row["algorithm"] for row in rows):
+        mine = [row for row in rows if row["algorithm"] == label]
+        last = max(int(row["step"]) for row in mine)
+        mine = [row for row in mine if int(row["step"]) == last]
         seeds = sorted({int(row["seed"]) for row in mine})
-        return np.array(
-            [[float(row[column]) for row in mine if int(row["seed"]) == seed] for seed in seeds]
-        )
+        found[label] = {
+            column: np.array(
+                [[float(row[column]) for row in mine if int(row["seed"]) == seed] for seed in seeds]
+            )
+            for column in (*COLUMNS, "human_data_usage", "total_steps")
+        }
+    return found
 
+
+COLUMNS = {"success": 2, "episodic_return": 0, "progress": 2, "episodic_cost": 2}
+
+
+def print_comparison(path: Path, reported: Mapping[str, Reported] | None = None) -> None:
+    """Methods side by side at their last evaluation, 95% intervals over seeds and scenarios.
+
+    Args:
+        path: A results.csv; nothing is printed where there is none.
+        reported: The paper's own figures by row, shown beside ours.
+    """
+    if not path.is_file():
+        return
+    found, reported = read_comparison(path), reported or {}
+    rng = np.random.default_rng(0)
     lines = []
-    for algorithm in algorithms:
-        human = scores(algorithm, "human_data_usage")[:, 0]
+    for label, scores in found.items():
+        human, total = scores["human_data_usage"][:, 0], scores["total_steps"][0, 0]
+        theirs = reported.get(label)
         lines.append(
             [
-                algorithm,
+                label,
                 str(len(human)),
-                f"{human.mean():.0f} ({human.mean() / last:.2f})",
-                str(last),
-                *[
-                    show(mean_interval(scores(algorithm, column), rng), digits)
-                    for column, digits in (
-                        ("success", 2),
-                        ("progress", 2),
-                        ("episodic_return", 0),
-                        ("episodic_cost", 2),
-                    )
-                ],
+                f"{human.mean():.0f} ({human.mean() / total:.2f})",
+                f"{total:.0f}",
+                *[show(mean_interval(scores[c], rng), digits) for c, digits in COLUMNS.items()],
             ]
+            + ([_cells(theirs)] if reported else [])
         )
-    print_table(
-        ["method", "seeds", "human data", "steps", "success", "route", "return", "cost"], lines
-    )
-    for other in algorithms[1:]:
-        first = scores(algorithms[0], "success")
-        if first.shape == scores(other, "success").shape:
-            gap = paired_difference(first, scores(other, "success"), rng)
-            print(f"success of {algorithms[0]} less {other}, paired: {show(gap, 2)}")
+    header = ["method", "seeds", "human data", "total", "success", "return", "route", "cost"]
+    print_table(header + ([_PAPER] if reported else []), lines)
+    if reported:
+        print("* the paper's own figures, from another simulator and another expert")
+    first, *others = found
+    for other in others:
+        a, b = found[first]["success"], found[other]["success"]
+        if a.shape == b.shape:
+            print(
+                f"success of {first} less {other}, paired: {show(paired_difference(a, b, rng), 2)}"
+            )
+
+
+_PAPER = "paper*: human/total, success, return, route"
+
+
+def _cells(reported: Reported | None) -> str:
+    if reported is None:
+        return "-"
+    data = f"{reported.human_data or '-'}/{reported.total_data or '-'}"
+    rest = (reported.success, reported.episodic_return, reported.route_completion)
+    return ", ".join([data, *(value or "-" for value in rest)])

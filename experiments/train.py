@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import sys
 import time
@@ -15,6 +16,7 @@ import numpy as np
 
 from envs import registered
 from experiments.evaluate import (
+    arrays_of,
     evaluate_policy,
     make_world,
     read_evaluation,
@@ -24,13 +26,13 @@ from experiments.evaluate import (
 from experiments.policy_file import save_policy
 from experiments.progress import Progress
 from experiments.runtime import UserError, device, revision, versions
-from ppl_jax import checkpoint
-from ppl_jax.algorithms import ALGORITHMS
+from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import HParams, TrainConfig, validate
 from ppl_jax.experts import SavedPolicy, neural_expert
-from ppl_jax.networks import layers
+from ppl_jax.losses import NEEDS_REFERENCE
+from ppl_jax.networks import Layers
 from ppl_jax.runlog import POLICY, SUMMARY, RunFolder
-from ppl_jax.training import Learner, TrainFunctions, make_train
+from ppl_jax.training import Learner, Phase, TrainFunctions, make_train, phases
 from ppl_jax.types import Env, Expert
 
 EVALUATE_EVERY = 1000  # steps
@@ -44,8 +46,9 @@ class RunSettings:
         env, algorithm, seed: What is trained.
         config, hparams: Static and traced settings.
         expert: "scripted", or a policy file.
+        reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
-        evaluate_every: Steps between evaluations (and checkpoints).
+        evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
     """
 
     env: str
@@ -54,6 +57,7 @@ class RunSettings:
     config: TrainConfig
     hparams: HParams
     expert: str = "scripted"
+    reference_policy: str | None = None
     scenarios: str | None = None
     held_out_scenarios: str | None = None
     evaluate_every: int = EVALUATE_EVERY
@@ -65,6 +69,7 @@ class RunSettings:
             "algorithm": self.algorithm,
             "seed": self.seed,
             "expert": self.expert,
+            "reference_policy": self.reference_policy,
             "scenarios": self.scenarios,
             "held_out_scenarios": self.held_out_scenarios,
             "evaluate_every": self.evaluate_every,
@@ -84,6 +89,7 @@ class RunSettings:
             config=TrainConfig(**config),
             hparams=HParams(**content["hparams"]),
             expert=content["expert"],
+            reference_policy=content["reference_policy"],
             scenarios=content["scenarios"],
             held_out_scenarios=content["held_out_scenarios"],
             evaluate_every=content["evaluate_every"],
@@ -100,14 +106,11 @@ def check(settings: RunSettings) -> None:
         raise UserError(
             f"unknown environment {settings.env!r}: choose one of {', '.join(registered())}"
         )
-    if settings.algorithm not in ALGORITHMS:
-        raise UserError(
-            f"unknown algorithm {settings.algorithm!r}: choose one of {', '.join(ALGORITHMS)}"
-        )
     if settings.seed < 0:
         raise UserError(f"seed must not be negative, got {settings.seed}")
     interval = settings.config.decision_interval
     try:
+        algorithms.method(settings.algorithm)
         validate(settings.config, settings.hparams)
     except ValueError as error:
         raise UserError(str(error)) from error
@@ -115,6 +118,17 @@ def check(settings: RunSettings) -> None:
         raise UserError(
             f"evaluate_every must be a positive multiple of decision_interval ({interval}), got "
             f"{settings.evaluate_every}"
+        )
+    needs = settings.config.objective in NEEDS_REFERENCE
+    if needs and settings.reference_policy is None:
+        raise UserError(
+            f"objective {settings.config.objective!r} needs a reference policy: give "
+            "--reference-policy FILE, a policy trained by --algorithm bc, for one"
+        )
+    if settings.reference_policy is not None and (settings.algorithm != "ppl" or not needs):
+        raise UserError(
+            f"reference_policy is for ppl with objective {' or '.join(NEEDS_REFERENCE)}, got "
+            f"{settings.algorithm} with {settings.config.objective}"
         )
 
 
@@ -135,9 +149,22 @@ def build(settings: RunSettings) -> tuple[Env, Expert]:
     return env, neural_expert(read_policy(settings.expert, env.spec))
 
 
-def saved_policy(env: Env, params: Any) -> SavedPolicy:
+def maker(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
+    """The method of a run, with its reference policy where it has one.
+
+    Raises:
+        UserError: If the reference policy's file cannot be used.
+    """
+    make = algorithms.method(settings.algorithm).make
+    if settings.reference_policy is None:
+        return make
+    policy = arrays_of(read_policy(settings.reference_policy, env.spec))
+    return functools.partial(make, reference=functools.partial(experts.act, policy))
+
+
+def saved_policy(env: Env, layers: Layers) -> SavedPolicy:
     """A trained policy as plain arrays on the world's raw observation."""
-    weights = [(np.asarray(w), np.asarray(b)) for w, b in layers(params)]
+    weights = [(np.asarray(w), np.asarray(b)) for w, b in layers]
     return SavedPolicy(
         weights, "relu", "tanh", env.spec.observation_mean, env.spec.observation_scale
     )
@@ -156,26 +183,77 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
     """
     check(settings)
     folder = RunFolder(out)
-    _open(folder, settings, resume)
     began = time.perf_counter()
     env, expert = build(settings)
-    functions = make_train(env, expert, ALGORITHMS[settings.algorithm], settings.config)
+    try:
+        functions = make_train(env, expert, maker(settings, env), settings.config)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    _open(folder, settings, resume)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
-    start = 0
+    plan = _plan(settings.config, settings.evaluate_every)
+    done = 0
     if resume:
-        start, learner = _restore(folder, learner)
-        folder.rewind(start)
-        if start >= settings.config.total_steps:
-            print(f"{out} is complete already ({start} steps)", file=sys.stderr)
+        done, learner = _restore(folder, learner)
+        evaluated = [chunk.step for chunk in plan if chunk.evaluate and chunk.end <= done]
+        folder.rewind(done, max(evaluated, default=-1))
+        if done >= plan[-1].end:
+            print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
     runner = _Runner(settings, folder, env, functions)
-    with Progress(settings.config.total_steps, f"train {settings.env}", start) as progress:
-        runner.compile(learner, start)
+    with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
+        waiting = [chunk for chunk in plan if chunk.end > done]
+        runner.compile(learner, waiting[-1])
         progress.start()
-        while start < settings.config.total_steps:
-            learner, start, note = runner.chunk(learner, start)
-            progress.update(start, note)
+        for chunk in waiting:
+            learner, note = runner.run(learner, chunk)
+            progress.update(chunk.end, note)
     return runner.finish(learner, time.perf_counter() - began)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Chunk:
+    """A piece of a run between two returns to the host.
+
+    Attributes:
+        phase: Of the loop.
+        length: Steps (updates in phase "fit").
+        end: Steps and offline updates of the run by then: what progress and checkpoints count.
+        step: Environment steps of the run by then.
+        evaluate: Whether the policy is evaluated then.
+    """
+
+    phase: Phase
+    length: int
+    end: int
+    step: int
+    evaluate: bool
+
+
+def _plan(config: TrainConfig, evaluate_every: int) -> list[_Chunk]:
+    """The chunks of a run; those of a phase are alike, its last may be shorter."""
+    plan: list[_Chunk] = []
+    end = step = 0
+    for phase, length in phases(config):
+        interact = phase == "interact"
+        size = evaluate_every if interact else _part(length, config.decision_interval)
+        left = length
+        while left:
+            piece = min(size, left)
+            left, end = left - piece, end + piece
+            step += 0 if phase == "fit" else piece
+            # what demonstrations alone teach is seen once, when they are learnt
+            plan.append(_Chunk(phase, piece, end, step, interact or (phase == "fit" and not left)))
+    if not plan[-1].evaluate:  # demonstrations that nothing is learnt from
+        plan[-1] = dataclasses.replace(plan[-1], evaluate=True)
+    return plan
+
+
+def _part(length: int, interval: int) -> int:
+    """A tenth of a long phase, in whole blocks."""
+    blocks = length // interval
+    parts = max(n for n in range(1, 11) if blocks % n == 0) if length >= 5000 else 1
+    return length // parts
 
 
 def _open(folder: RunFolder, settings: RunSettings, resume: bool) -> None:
@@ -224,68 +302,65 @@ class _Runner:
         self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
         self.compile_s = self.train_s = 0.0
         self.trained_steps = 0
-        self.programs: dict[int, Callable[[Learner], Any]] = {}
+        self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
 
-    def _length(self, start: int) -> int:
-        return min(self.settings.evaluate_every, self.settings.config.total_steps - start)
-
-    def _program(self, learner: Learner, length: int) -> Callable[[Learner], Any]:
-        if length not in self.programs:
-            blocks = length // self.settings.config.decision_interval
+    def _program(self, learner: Learner, chunk: _Chunk) -> Callable[[Learner], Any]:
+        kind = (chunk.phase, chunk.length)
+        if kind not in self.programs:
+            blocks = chunk.length // self.settings.config.decision_interval
 
             def run(learner: Learner) -> Any:
-                return self.functions.run_chunk(learner, blocks)
+                return self.functions.run_chunk(learner, blocks, chunk.phase)
 
             began = time.perf_counter()
             jitted = jax.jit(run, donate_argnums=0)
-            self.programs[length] = jitted.lower(learner).compile()
+            self.programs[kind] = jitted.lower(learner).compile()
             self.compile_s += time.perf_counter() - began
-        return self.programs[length]
+        return self.programs[kind]
 
-    def compile(self, learner: Learner, start: int) -> None:
-        """Compile the training program ahead of time."""
-        self._program(learner, self._length(start))
+    def compile(self, learner: Learner, chunk: _Chunk) -> None:
+        """Compile a chunk's program ahead of time."""
+        self._program(learner, chunk)
 
-    def chunk(self, learner: Learner, start: int) -> tuple[Learner, int, str]:
-        """Train to the next evaluation, evaluate, log, save."""
-        length = self._length(start)
-        program = self._program(learner, length)
+    def run(self, learner: Learner, chunk: _Chunk) -> tuple[Learner, str]:
+        """Train to the end of a chunk, evaluate, log, save; returns learner and a note."""
+        program = self._program(learner, chunk)
         began = time.perf_counter()
         learner, metrics = jax.block_until_ready(program(learner))
         seconds = time.perf_counter() - began
-        self.train_s += seconds
-        self.trained_steps += length
-        step = start + length
-        params = self.functions.algorithm.policy_params(learner.algorithm)
-        rows = evaluate_policy(self.env, saved_policy(self.env, params), step)
-        scores = summarise_episodes(rows)
+        if chunk.phase == "interact":
+            self.train_s += seconds
+            self.trained_steps += chunk.length
+        layers = self.functions.algorithm.policy(learner.algorithm)
         human = int(learner.counters.human_data)
-        self.folder.append_evaluation([row._asdict() | {"human_data_usage": human} for row in rows])
-        values = {name: float(value) for name, value in metrics.items()}
-        self.folder.append_metrics(
-            {"step": step}
-            | values
-            | {f"eval/{name}": value for name, value in scores.items()}
-            | {"time/chunk_s": round(seconds, 3), "train/diverged": bool(learner.diverged)}
-        )
-        self._save(step, learner, params)
-        note = f"success {scores['success_rate']:.2f}, human data {human}"
+        row = {"step": chunk.step, "done": chunk.end, "phase": chunk.phase}
+        row |= {name: float(value) for name, value in metrics.items()}
+        note = f"human data {human}"
+        if chunk.evaluate:
+            rows = evaluate_policy(self.env, saved_policy(self.env, layers), chunk.step)
+            scores = summarise_episodes(rows)
+            self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
+            row |= {f"eval/{name}": value for name, value in scores.items()}
+            note = f"success {scores['success_rate']:.2f}, {note}"
+        row |= {"time/chunk_s": round(seconds, 3), "train/diverged": bool(learner.diverged)}
+        self.folder.append_metrics(row)
+        self._save(chunk, learner, layers)
         if bool(learner.diverged):
             note += ", DIVERGED: the policy stays as it was"
-        return learner, step, note
+        return learner, note
 
-    def _save(self, step: int, learner: Learner, params: Any) -> None:
+    def _save(self, chunk: _Chunk, learner: Learner, layers: Layers) -> None:
         save_policy(
             self.folder.path / POLICY,
-            saved_policy(self.env, params),
+            saved_policy(self.env, layers),
             {
                 "env": self.settings.env,
                 "algorithm": self.settings.algorithm,
                 "seed": self.settings.seed,
-                "step": step,
+                "step": chunk.step,
             },
         )
-        checkpoint.save(self.folder.checkpoints, step, learner)
+        checkpoint.save(self.folder.checkpoints, chunk.end, learner)
 
     def finish(self, learner: Learner, wall_s: float) -> dict[str, Any]:
         """Write and return the summary."""

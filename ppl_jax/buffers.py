@@ -66,3 +66,60 @@ def sample(buffer: RingBuffer, key: jax.Array, count: int) -> PyTree:
     """
     index = jax.random.randint(key, (count,), 0, jnp.maximum(size(buffer), 1))
     return jax.tree.map(lambda leaf: leaf[index], buffer.data)
+
+
+@flax.struct.dataclass
+class SplitBuffer:
+    """Steps by who was in control, for methods that learn from both.
+
+    Attributes:
+        human: Steps under the expert's control.
+        robot: Steps under the novice's.
+    """
+
+    human: RingBuffer
+    robot: RingBuffer
+
+
+def init_split(item: PyTree, human_capacity: int, robot_capacity: int) -> SplitBuffer:
+    """Two empty buffers for items like `item`."""
+    return SplitBuffer(init_buffer(item, human_capacity), init_buffer(item, robot_capacity))
+
+
+def add_split(split: SplitBuffer, item: PyTree, takeover: jax.Array) -> SplitBuffer:
+    """Append one item to the one buffer or the other."""
+    row = jax.tree.map(lambda leaf: leaf[None], item)
+    return SplitBuffer(
+        add(split.human, row, takeover[None]), add(split.robot, row, ~takeover[None])
+    )
+
+
+def sample_split(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
+    """`count` items, one half from either buffer (human first), and their weights.
+
+    Returns:
+        Items and [count] weights of mean 1: all 1 where both buffers hold something; where one is
+        empty its half weighs 0 and the other 2; all 0 where both are.
+    """
+    key_human, key_robot = jax.random.split(key)
+    half = count // 2
+    ours = sample(split.human, key_human, half)
+    theirs = sample(split.robot, key_robot, count - half)
+    items = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ours, theirs)
+    held = jnp.where(jnp.arange(count) < half, size(split.human), size(split.robot)) > 0
+    return items, held / jnp.maximum(jnp.mean(held), 1e-9)
+
+
+def sample_both(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
+    """`count` items, every step alike whoever made it; weights like `sample_split`'s."""
+    human, robot = size(split.human), size(split.robot)
+    row = jax.random.randint(key, (count,), 0, jnp.maximum(human + robot, 1))
+    ours = row < human
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        theirs = jnp.clip(row - human, 0, b.shape[0] - 1)
+        mask = ours.reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(mask, a[jnp.clip(row, 0, a.shape[0] - 1)], b[theirs])
+
+    items = jax.tree.map(pick, split.human.data, split.robot.data)
+    return items, jnp.ones(count) * (human + robot > 0)

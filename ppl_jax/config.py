@@ -30,6 +30,16 @@ class HParams:
             at or below (the paper's epsilon).
         max_departure: Gate "departs": how far the prediction may end from where the expert would,
             in the world's units (`WorldSpec.observation_scale`).
+        discount, target_rate: gamma, and tau of target networks (methods with critics).
+        margin: EIL: hinge margins of its action values.
+        conservative_weight: HACO: c, weight of raising expert's over novice's action values.
+        max_doubt: Ensemble-DAgger: variance of the members' actions above which the expert acts.
+        max_discrepancy: Ensemble-DAgger: squared distance between the novice's and the expert's
+            action above which the expert acts.
+        switch_rate: Thrifty-DAgger: alpha, share of the novice's states that each of its two tests
+            is to hand to the expert.
+        discriminator_rate: GAIL: learning rate of the discriminator.
+        survival_correction: GAIL: 1 for the reward log D - log(1 - D), 0 for -log(1 - D).
     """
 
     preference_horizon: jax.Array | float = 4
@@ -43,6 +53,15 @@ class HParams:
     min_speed: jax.Array | float = 5.0
     min_return: jax.Array | float = 10.0
     max_departure: jax.Array | float = 1.0
+    discount: jax.Array | float = 0.99
+    target_rate: jax.Array | float = 0.005
+    margin: jax.Array | float = 0.1
+    conservative_weight: jax.Array | float = 10.0
+    max_doubt: jax.Array | float = 0.01
+    max_discrepancy: jax.Array | float = 0.05
+    switch_rate: jax.Array | float = 0.1
+    discriminator_rate: jax.Array | float = 3e-4
+    survival_correction: jax.Array | float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +69,10 @@ class TrainConfig:
     """What sets shapes and programs.
 
     Attributes:
-        total_steps: Environment steps of the run.
+        total_steps: Environment steps of the run, its demonstrations included.
+        demonstrations: Steps at the start of the run that the expert makes all by itself, without
+            updates.
+        offline_updates: Updates that follow them, before the novice makes its first step.
         prediction_horizon: H, steps of the lookahead the expert sees.
         decision_interval: Steps a decision holds; a new one is made at steps 0, K, 2K, ...
         max_preference_horizon: Largest L a run may use (L itself is traced).
@@ -68,9 +90,18 @@ class TrainConfig:
         likelihood: Which log pi the losses mean (see `ppl_jax.distributions`).
         bc_reduction: Squared error summed (the log-likelihood) or averaged over action dimensions.
         random_steps: Steps at the start in which the novice proposes uniform random actions.
+        objective: What is minimised on preference pairs (see `ppl_jax.losses`).
+        objective_target: Margin that IPO and SLiC-HF aim at: that of a policy which acts as the
+            expert did, or the libraries' constants (which bounded actions cannot reach).
+        preferred, rejected: Actions of the pairs: as in the paper, or (for its ablations) uniform
+            random ones.
+        members: Policies of an ensemble.
+        rollout_steps: Steps between the updates of an on-policy method.
     """
 
     total_steps: int = 10_000
+    demonstrations: int = 0
+    offline_updates: int = 0
     prediction_horizon: int = 10
     decision_interval: int = 10
     max_preference_horizon: int = 10
@@ -85,6 +116,12 @@ class TrainConfig:
     likelihood: Literal["gaussian", "laplace"] = "gaussian"
     bc_reduction: Literal["sum", "mean"] = "sum"
     random_steps: int = 0
+    objective: Literal["cpo", "dpo", "ipo", "slic_hf", "imitation"] = "cpo"
+    objective_target: Literal["pair", "library"] = "pair"
+    preferred: Literal["expert", "random"] = "expert"
+    rejected: Literal["novice", "random"] = "novice"
+    members: int = 5
+    rollout_steps: int = 2000
 
 
 # what the paper sets per task where it differs from driving (section 5 and its appendix)
@@ -168,6 +205,8 @@ _AT_LEAST_ONE = (
     "batch_size",
     "human_capacity",
     "preference_capacity",
+    "members",
+    "rollout_steps",
 )
 _NOT_NEGATIVE = (
     "beta",
@@ -178,7 +217,16 @@ _NOT_NEGATIVE = (
     "expert_noise",
     "learning_rate",
     "max_departure",
+    "target_rate",
+    "margin",
+    "conservative_weight",
+    "max_doubt",
+    "max_discrepancy",
+    "switch_rate",
+    "discriminator_rate",
+    "survival_correction",
 )
+_SHARES = ("discount", "target_rate", "switch_rate", "survival_correction")
 
 
 def validate(config: TrainConfig, hparams: HParams) -> None:
@@ -195,10 +243,22 @@ def validate(config: TrainConfig, hparams: HParams) -> None:
         value = getattr(config, field)
         if value < 1:
             raise ValueError(f"{field} must be at least 1, got {value}")
-    if config.total_steps % config.decision_interval:
+    for field in ("total_steps", "demonstrations", "offline_updates"):
+        value = getattr(config, field)
+        if value < 0 or value % config.decision_interval:
+            raise ValueError(
+                f"{field} must be a multiple of decision_interval ({config.decision_interval}), "
+                f"got {value}"
+            )
+    if config.demonstrations > config.total_steps:
         raise ValueError(
-            f"total_steps must be a multiple of decision_interval ({config.decision_interval}), "
-            f"got {config.total_steps}"
+            f"demonstrations must not exceed total_steps ({config.total_steps}), got "
+            f"{config.demonstrations}"
+        )
+    if config.offline_updates and not config.demonstrations:
+        raise ValueError(
+            f"offline_updates needs demonstrations to learn from, got {config.offline_updates} "
+            "without any"
         )
     if not config.hidden or min(config.hidden) < 1:
         raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
@@ -219,6 +279,10 @@ def validate(config: TrainConfig, hparams: HParams) -> None:
         value = jnp.asarray(getattr(hparams, field))
         if not bool(jnp.all(value >= 0)):  # catches NaN too
             raise ValueError(f"{field} must not be negative, got {_show(value)}")
+    for field in _SHARES:
+        value = jnp.asarray(getattr(hparams, field))
+        if not bool(jnp.all((value >= 0) & (value <= 1))):
+            raise ValueError(f"{field} must lie between 0 and 1, got {_show(value)}")
 
 
 def _show(value: jax.Array) -> Any:

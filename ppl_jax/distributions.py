@@ -39,3 +39,32 @@ def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -
     if kind == "gaussian":
         return -square
     return -(jnp.sqrt(square + LAPLACE_CORE**2) - LAPLACE_CORE) / LAPLACE_SCALE
+
+
+def gaussian_log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
+    """Log-density of a Gaussian without squashing (PPO's), [..., A] -> [...]."""
+    scaled = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), -1)
+
+
+def squashed_gaussian(
+    key: jax.Array, mean: jax.Array, log_std: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """A reparameterised sample a = tanh(u), u ~ N(mean, std), and its log-density (SAC's).
+
+        log pi(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))
+
+    The density is taken at u, so that nothing is inverted where tanh saturates.
+
+    Args:
+        key: Random key.
+        mean: [..., A].
+        log_std: [..., A], clipped to [-20, 2].
+
+    Returns:
+        [..., A] in [-1, 1], [...].
+    """
+    log_std = jnp.clip(log_std, -20.0, 2.0)
+    u = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    squashing = jnp.sum(2.0 * (jnp.log(2.0) - u - jax.nn.softplus(-2.0 * u)), -1)
+    return jnp.tanh(u), gaussian_log_prob(mean, log_std, u) - squashing

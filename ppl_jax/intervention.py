@@ -8,13 +8,14 @@ predicted to do from here, for rules in `COMPARING`, and None for the others; `s
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax.config import HParams
-from ppl_jax.types import Trajectory
+from ppl_jax.types import DecisionPoint, Trajectory
 
 Scale = np.ndarray | jax.Array
 Rule = Callable[[Trajectory, Trajectory | None, HParams, Scale], jax.Array]
@@ -62,6 +63,27 @@ def departs(
     apart = jnp.max(jnp.abs(trajectory.observation[-1] - experts.observation[-1]) / scale)
     elsewhere = (apart > hparams.max_departure) & ~jnp.any(trajectory.success)
     return jnp.any(trajectory.unsafe) | elsewhere
+
+
+Gate = Callable[[Any, DecisionPoint, HParams], jax.Array]
+"""`decide` of a method (see `ppl_jax.algorithms.base.Algorithm`)."""
+
+
+def make_gate(name: str, scale: Scale) -> Gate:
+    """The gate that a `TrainConfig.gate` names, as the methods that share it use it."""
+    rule = RULES[name]
+
+    def decide(state: Any, point: DecisionPoint, hparams: HParams) -> jax.Array:
+        del state
+        return rule(point.trajectory, point.experts, hparams, scale)
+
+    return decide
+
+
+def never(state: Any, point: DecisionPoint, hparams: HParams) -> jax.Array:
+    """The gate of a method that nobody watches."""
+    del state, point, hparams
+    return jnp.zeros((), bool)
 
 
 RULES: dict[str, Rule] = {

@@ -4,10 +4,24 @@
     L_pref = -E_{D_pref}[ log sigmoid(beta log pi(a+|s) - beta log pi(a-|s)) ]
     L_bc   = -E_{D_h}[ log pi(a_h|s) ]
 
-There is no reward, critic or reference policy in them.
+There is no reward and no critic in them. Other objectives can stand in L_pref's place; with
+Delta = log pi(a+|s) - bias log pi(a-|s), h = Delta - Delta of a frozen reference policy:
+
+    cpo         -log sigmoid(beta Delta)             the paper's (Xu et al. 2024, no NLL term)
+    dpo         -log sigmoid(beta h)                 Rafailov et al. 2023
+    ipo         (h - target)^2                       Azar et al. 2024
+    slic_hf     max(0, target - Delta)               Zhao et al. 2023; L_bc is its regulariser
+    imitation   -log pi(a+|s)                        the paper's ablation: cloning of a+, a- unused
+
+Libraries aim IPO at 1 / (2 beta) and SLiC-HF at 1. A policy with bounded actions cannot open such a
+gap between near actions: it is driven to a corner of the action box. The target "pair" is the
+Delta of a policy that acts as the expert did, mu(s) = a+; for IPO the h of that policy, or 0
+where the reference has a wider gap already.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,48 +36,114 @@ def bc_loss(
     expert_action: jax.Array,
     likelihood: str = "gaussian",
     reduction: str = "sum",
+    weight: jax.Array | float = 1.0,
 ) -> tuple[jax.Array, Metrics]:
-    """Behaviour cloning: -E[log pi(a_h|s)].
+    """Behaviour cloning: -E[weight log pi(a_h|s)].
 
     Args:
-        mean: [B, A] policy actions.
-        expert_action: [B, A].
+        mean: [..., A] policy actions.
+        expert_action: [..., A].
         likelihood: See `ppl_jax.distributions`.
         reduction: "sum" over action dimensions (the log-likelihood), or "mean" (the released
             code's mean squared error).
+        weight: [...] of mean 1.
     """
-    loss = -jnp.mean(log_likelihood(mean, expert_action, likelihood))
+    loss = -jnp.mean(weight * log_likelihood(mean, expert_action, likelihood))
     if reduction == "mean":
         loss = loss / mean.shape[-1]
     return loss, {"loss_bc": loss}
 
 
-def cpo_loss(
+class PairLikelihoods(NamedTuple):
+    """Log-likelihoods of a batch of preference pairs, [B] each.
+
+    Attributes:
+        preferred, rejected: log pi(a+|s), log pi(a-|s) of the policy.
+        reference: Delta of the frozen reference policy (0 without one).
+        attained: Delta of a policy that acts as preferred.
+    """
+
+    preferred: jax.Array
+    rejected: jax.Array
+    reference: jax.Array | float
+    attained: jax.Array
+
+
+def pair_likelihoods(
     preferred_mean: jax.Array,
     preferred_action: jax.Array,
     rejected_mean: jax.Array,
     rejected_action: jax.Array,
-    beta: jax.Array | float,
     bias: jax.Array | float = 1.0,
     likelihood: str = "gaussian",
-) -> tuple[jax.Array, Metrics]:
-    """Contrastive preference loss: -E[log sigmoid(beta (log pi(a+|s) - bias log pi(a-|s)))].
+    reference: tuple[jax.Array, jax.Array] | None = None,
+) -> PairLikelihoods:
+    """What every objective needs of a batch of pairs.
 
     Args:
         preferred_mean, rejected_mean: [B, A] policy actions at the states of either action (the
             same state in the paper).
         preferred_action, rejected_action: [B, A].
-        beta: Temperature.
-        bias: 1 in the paper; 0.5 in the released code, where -bias is the "contrastive bias" of
-            contrastive preference learning.
+        bias: Factor on the rejected action's likelihood; 1 in the paper.
         likelihood: See `ppl_jax.distributions`.
+        reference: The reference policy's two means, like the first and third argument.
     """
-    preferred = log_likelihood(preferred_mean, preferred_action, likelihood)
-    rejected = log_likelihood(rejected_mean, rejected_action, likelihood)
-    loss = -jnp.mean(jax.nn.log_sigmoid(beta * (preferred - bias * rejected)))
+
+    def log_pi(mean: jax.Array, action: jax.Array) -> jax.Array:
+        return log_likelihood(mean, action, likelihood)
+
+    frozen: jax.Array | float = 0.0
+    if reference is not None:
+        first, second = reference
+        frozen = log_pi(first, preferred_action) - bias * log_pi(second, rejected_action)
+    return PairLikelihoods(
+        preferred=log_pi(preferred_mean, preferred_action),
+        rejected=log_pi(rejected_mean, rejected_action),
+        reference=frozen,
+        attained=log_pi(preferred_action, preferred_action)
+        - bias * log_pi(preferred_action, rejected_action),
+    )
+
+
+NEEDS_REFERENCE = ("dpo", "ipo")
+
+
+def preference_loss(
+    pairs: PairLikelihoods,
+    beta: jax.Array | float,
+    bias: jax.Array | float = 1.0,
+    objective: str = "cpo",
+    target: str = "pair",
+) -> tuple[jax.Array, Metrics]:
+    """A preference objective; see the top of this file.
+
+    Args:
+        pairs: Of a batch.
+        beta: Temperature (of cpo and dpo; of ipo's library target).
+        bias: 1 in the paper; 0.5 in the released code, where -bias is the "contrastive bias" of
+            contrastive preference learning. The same as given to `pair_likelihoods`.
+        objective: "cpo", "dpo", "ipo", "slic_hf" or "imitation".
+        target: "pair" or "library".
+    """
+    delta = pairs.preferred - bias * pairs.rejected
+    gained = delta - pairs.reference
+    if objective == "cpo":
+        each = -jax.nn.log_sigmoid(beta * delta)
+    elif objective == "dpo":
+        each = -jax.nn.log_sigmoid(beta * gained)
+    elif objective == "ipo":
+        reachable = jnp.maximum(pairs.attained - pairs.reference, 0.0)
+        each = (gained - (0.5 / beta if target == "library" else reachable)) ** 2
+    elif objective == "slic_hf":
+        each = jax.nn.relu((1.0 if target == "library" else pairs.attained) - delta)
+    elif objective == "imitation":
+        each = -pairs.preferred
+    else:
+        raise ValueError(f"unknown objective {objective!r}")
+    loss = jnp.mean(each)
     return loss, {
         "loss_preference": loss,
-        "log_likelihood_preferred": jnp.mean(preferred),
-        "log_likelihood_rejected": jnp.mean(rejected),
-        "preference_accuracy": jnp.mean(preferred > rejected),
+        "log_likelihood_preferred": jnp.mean(pairs.preferred),
+        "log_likelihood_rejected": jnp.mean(pairs.rejected),
+        "preference_accuracy": jnp.mean(pairs.preferred > pairs.rejected),
     }

@@ -82,8 +82,13 @@ class RunFolder:
                 writer.writeheader()
             writer.writerows(rows)
 
-    def rewind(self, step: int) -> None:
-        """Drop what was logged after `step`: a resumed run writes it again."""
+    def rewind(self, done: int, step: int) -> None:
+        """Drop what was logged later: a resumed run writes it again.
+
+        Args:
+            done: Steps and offline updates done: metrics up to there stay.
+            step: Environment step of the last evaluation that stays.
+        """
         metrics = self.path / METRICS
         if metrics.exists():
             kept = []
@@ -92,7 +97,7 @@ class RunFolder:
                     row = json.loads(line)
                 except ValueError:  # the line that was being written when the run was killed
                     continue
-                if row["step"] <= step:
+                if row["done"] <= done:
                     kept.append(line + "\n")
             _replace(metrics, "".join(kept))
         evaluation = self.path / EVALUATION

@@ -1,8 +1,11 @@
-"""The training loop of every interactive method: Algorithm 1 of the paper as pure functions.
+"""The training loop of every method: Algorithm 1 of the paper as pure functions.
 
 At steps 0, K, 2K, ... the novice proposes an action, the predictor rolls it H steps ahead, and the
 decision whether the expert takes over holds for K steps. Each step is executed, stored and followed
 by one update. Everything is one scan over blocks of K steps; the host acts between chunks of them.
+
+A run has up to three phases: in `demonstrate` the expert makes every step and nothing is updated,
+in `fit` there are updates and no steps, `interact` is the above. Most methods have only the last.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -20,9 +23,10 @@ from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig, as_arrays
 from ppl_jax.losses import Metrics
 from ppl_jax.predictor import add_noise, predict, selected_transition
-from ppl_jax.types import Env, Expert, Interaction, Trajectory
+from ppl_jax.types import DecisionPoint, Env, Expert, Interaction, Trajectory
 
 PyTree = Any
+Phase = Literal["demonstrate", "fit", "interact"]
 
 
 @flax.struct.dataclass
@@ -75,17 +79,28 @@ class TrainFunctions(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        run_chunk: `run_chunk(learner, blocks) -> (Learner, Metrics)` for a static number of blocks
-            of `decision_interval` steps; metrics are means over the chunk.
-        train: `train(key, hparams) -> (Learner, Metrics)`: the whole run, metrics per tenth, [10].
-        act: `act(policy_params, observation) -> action`.
+        run_chunk: `run_chunk(learner, blocks, phase="interact") -> (Learner, Metrics)` for a static
+            number of blocks of `decision_interval` steps (or updates, in phase "fit"); metrics
+            are means over the chunk.
+        train: `train(key, hparams) -> (Learner, Metrics)`: the whole run, metrics per tenth of its
+            last phase, [10].
         algorithm: The method.
     """
 
     init: Callable[[jax.Array, HParams], Learner]
-    run_chunk: Callable[[Learner, int], tuple[Learner, Metrics]]
+    run_chunk: Callable[..., tuple[Learner, Metrics]]
     train: Callable[[jax.Array, HParams], tuple[Learner, Metrics]]
     algorithm: Algorithm
+
+
+def phases(config: TrainConfig) -> list[tuple[Phase, int]]:
+    """The phases of a run and how many steps (updates, in "fit") each has; none are empty."""
+    all_phases: list[tuple[Phase, int]] = [
+        ("demonstrate", config.demonstrations),
+        ("fit", config.offline_updates),
+        ("interact", config.total_steps - config.demonstrations),
+    ]
+    return [(phase, length) for phase, length in all_phases if length]
 
 
 def make_train(
@@ -107,12 +122,14 @@ def make_train(
         env_params: The world's parameters; its training ones where None.
 
     Raises:
-        ValueError: If the world lacks the predictor that `config` names.
+        ValueError: If the world lacks the predictor that `config` names, or the run's length does
+            not fit the method's rounds.
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
     transition = selected_transition(env, config.predictor)
     interval = config.decision_interval
+    check_rounds(algorithm, config)
 
     def init(key: jax.Array, hparams: HParams) -> Learner:
         key, key_algorithm, key_env = jax.random.split(key, 3)
@@ -129,15 +146,23 @@ def make_train(
         )
 
     def propose(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
-        action = algorithm.act(learner.algorithm, observation)
+        key_act, key_guess = jax.random.split(key)
+        action = algorithm.act(learner.algorithm, key_act, observation)
         if config.random_steps:
-            guess = jax.random.uniform(key, action.shape, minval=-1.0, maxval=1.0)
+            guess = jax.random.uniform(key_guess, action.shape, minval=-1.0, maxval=1.0)
             action = jnp.where(learner.counters.steps < config.random_steps, guess, action)
         return action
 
+    def advise(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
+        """The expert's action, with its noise."""
+        key_expert, key_noise = jax.random.split(key)
+        action = expert(key_expert, learner.env_state, observation, params)
+        noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
+        return jnp.clip(action + noise, -1.0, 1.0)
+
     def decide(learner: Learner, key: jax.Array) -> jax.Array:
         """Whether the expert takes the next block."""
-        key_propose, key_predict = jax.random.split(key)
+        key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
         observation = env.observe(learner.env_state, params)
         action = propose(learner, key_propose, observation)
         roll = functools.partial(
@@ -152,10 +177,16 @@ def make_train(
             observe=algorithm.compares,
         )
         asked_again = config.gate_rollout == "closed_loop" or algorithm.compares
-        act = functools.partial(algorithm.act, learner.algorithm)
-        trajectory = roll(act=act if asked_again else None)
-        experts = roll(expert=expert) if algorithm.compares else None
-        return algorithm.decide(learner.algorithm, trajectory, experts, learner.hparams)
+        act = functools.partial(algorithm.act, learner.algorithm, key_act)
+        point = DecisionPoint(
+            observation=observation,
+            novice_action=action,
+            expert_action=advise(learner, key_expert, observation),
+            takeover=learner.takeover,
+            trajectory=roll(act=act if asked_again else None),
+            experts=roll(expert=expert) if algorithm.compares else None,
+        )
+        return algorithm.decide(learner.algorithm, point, learner.hparams)
 
     def ahead(
         takeover: jax.Array, key: jax.Array, state: PyTree, action: jax.Array, params: PyTree
@@ -183,18 +214,16 @@ def make_train(
         noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
         return dataclasses.replace(trajectory, observation=noisy)
 
-    def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
-        """One environment step: act, store, update."""
-        keys = jax.random.split(learner.key, 8)
-        key, key_propose, key_expert, key_noise, key_ahead, key_env, key_reset, key_update = keys
+    def interact(learner: Learner, started: jax.Array) -> Learner:
+        """One environment step: act and store."""
+        keys = jax.random.split(learner.key, 6)
+        key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
         hparams, state = learner.hparams, learner.env_state
         observation = env.observe(state, params)
         novice_action = propose(learner, key_propose, observation)
-        expert_action = expert(key_expert, state, observation, params)
-        noise = hparams.expert_noise * jax.random.normal(key_noise, expert_action.shape)
-        expert_action = jnp.clip(expert_action + noise, -1.0, 1.0)
+        expert_action = advise(learner, key_expert, observation)
         takeover = learner.takeover
-        executed = jnp.where(takeover, expert_action, novice_action)
+        executed = jnp.where(takeover, expert_action, jnp.clip(novice_action, -1.0, 1.0))
         if algorithm.uses_predictions:
             predicted = look_ahead(learner, key_ahead, novice_action)
         else:
@@ -213,20 +242,9 @@ def make_train(
             cost=outcome.cost,
             terminated=outcome.terminated,
             truncated=outcome.truncated,
+            success=outcome.success,
             predicted=predicted,
         )
-        stored = algorithm.store(learner.algorithm, interaction, hparams)
-        updated, metrics = algorithm.update(stored, key_update, hparams)
-        finite = jnp.all(
-            jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)])
-        )
-        diverged = learner.diverged | ~finite
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(diverged, old, new),
-            updated.learned,
-            stored.learned,
-        )
-        updated = dataclasses.replace(updated, learned=kept)
         done = outcome.terminated | outcome.truncated
         restarted = jax.lax.cond(
             done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset
@@ -244,13 +262,33 @@ def make_train(
         # a takeover ends with its episode; the next decision waits for the grid
         return dataclasses.replace(
             learner,
-            algorithm=updated,
+            algorithm=algorithm.store(learner.algorithm, interaction, hparams),
             env_state=restarted,
             takeover=takeover & ~done,
             key=key,
             counters=counters,
-            diverged=diverged,
-        ), metrics
+        )
+
+    def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
+        """One update; where a loss is not finite, what was learned stays as it was."""
+        key, key_update = jax.random.split(learner.key)
+        before = learner.algorithm
+        updated, metrics = update(before, key_update, learner.hparams)
+        finite = jnp.all(
+            jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)])
+        )
+        diverged = learner.diverged | ~finite
+        kept = jax.tree.map(
+            lambda new, old: jnp.where(diverged, old, new), updated.learned, before.learned
+        )
+        updated = dataclasses.replace(updated, learned=kept)
+        return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
+
+    def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
+        learner = interact(learner, started)
+        if algorithm.update_every > 1:
+            return learner, {}
+        return learn(learner, algorithm.update)
 
     def block(learner: Learner, _: None) -> tuple[Learner, Metrics]:
         key, key_decide = jax.random.split(learner.key)
@@ -261,21 +299,71 @@ def make_train(
         learner, metrics = jax.lax.scan(step, learner, first & ~was_expert)
         return learner, jax.tree.map(jnp.mean, metrics)
 
-    def run_chunk(learner: Learner, blocks: int) -> tuple[Learner, Metrics]:
-        before = learner.counters
-        learner, metrics = jax.lax.scan(block, learner, None, length=blocks)
+    def round_of_blocks(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+        learner = jax.lax.scan(block, learner, None, length=algorithm.update_every // interval)[0]
+        return learn(learner, algorithm.update)
+
+    def demonstrated_step(learner: Learner, _: None) -> tuple[Learner, None]:
+        started = ~learner.takeover  # at the start of an episode
+        learner = dataclasses.replace(learner, takeover=jnp.ones((), bool))
+        return interact(learner, started), None
+
+    def fitted(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+        return learn(learner, algorithm.fit or algorithm.update)
+
+    def run_chunk(
+        learner: Learner, blocks: int, phase: Phase = "interact"
+    ) -> tuple[Learner, Metrics]:
+        metrics: Metrics
+        before, length = learner.counters, blocks * interval
+        if phase == "demonstrate":
+            learner, _ = jax.lax.scan(demonstrated_step, learner, None, length=length)
+            metrics = {}
+        elif phase == "fit":
+            learner, metrics = jax.lax.scan(fitted, learner, None, length=length)
+        elif algorithm.update_every > 1:
+            rounds = length // algorithm.update_every
+            learner, metrics = jax.lax.scan(round_of_blocks, learner, None, length=rounds)
+        else:
+            learner, metrics = jax.lax.scan(block, learner, None, length=blocks)
         return learner, summarise(metrics, before, learner.counters)
 
     def train(key: jax.Array, hparams: HParams) -> tuple[Learner, Metrics]:
-        blocks = config.total_steps // interval
-        parts = max(n for n in range(1, 11) if blocks % n == 0)
+        learner = init(key, hparams)
+        *first, (last, length) = phases(config)
+        for phase, count in first:
+            learner, _ = run_chunk(learner, count // interval, phase)
+        unit = algorithm.update_every if last == "interact" else 1
+        units = length // max(unit, interval)
+        parts = max(n for n in range(1, 11) if units % n == 0)
 
         def part(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-            return run_chunk(learner, blocks // parts)
+            return run_chunk(learner, length // parts // interval, last)
 
-        return jax.lax.scan(part, init(key, hparams), None, length=parts)
+        return jax.lax.scan(part, learner, None, length=parts)
 
     return TrainFunctions(init, run_chunk, train, algorithm)
+
+
+def check_rounds(algorithm: Algorithm, config: TrainConfig) -> None:
+    """Check that a method's rounds fit the decision grid and the run.
+
+    Raises:
+        ValueError: One line naming field, value and what is allowed.
+    """
+    every, interval = algorithm.update_every, config.decision_interval
+    if every == 1:
+        return
+    if every % interval:
+        raise ValueError(
+            f"rollout_steps must be a multiple of decision_interval ({interval}), got {every}"
+        )
+    rest = config.total_steps - config.demonstrations
+    if rest % every:
+        raise ValueError(
+            f"total_steps less demonstrations must be a multiple of rollout_steps ({every}) for "
+            f"{algorithm.name}, got {rest}"
+        )
 
 
 def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:

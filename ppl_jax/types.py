@@ -85,7 +85,7 @@ class Interaction:
         takeover: The expert was in control.
         takeover_start: It was not in the step before.
         reward, cost: Scalars.
-        terminated, truncated: Booleans.
+        terminated, truncated, success: Booleans.
         predicted: First `max_preference_horizon` steps of the novice's held action, from here.
     """
 
@@ -100,7 +100,28 @@ class Interaction:
     cost: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    success: jax.Array
     predicted: Trajectory
+
+
+@flax.struct.dataclass
+class DecisionPoint:
+    """What is known where it is decided who acts for the next steps.
+
+    Attributes:
+        observation: [O].
+        novice_action, expert_action: [A] what either would do now.
+        takeover: The expert has been in control until now.
+        trajectory: Where the novice's action is predicted to lead.
+        experts: Where the expert's are, if the method asks for it, else None.
+    """
+
+    observation: jax.Array
+    novice_action: jax.Array
+    expert_action: jax.Array
+    takeover: jax.Array
+    trajectory: Trajectory
+    experts: Trajectory | None
 
 
 @flax.struct.dataclass

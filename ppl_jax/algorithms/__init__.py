@@ -2,9 +2,140 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
-from ppl_jax.algorithms.ppl import make_bc_only, make_ppl
+from ppl_jax.algorithms.bc import make_bc
+from ppl_jax.algorithms.eil import make_eil
+from ppl_jax.algorithms.ensemble_dagger import make_ensemble_dagger
+from ppl_jax.algorithms.gail import make_gail
+from ppl_jax.algorithms.haco import make_haco, make_haco_port
+from ppl_jax.algorithms.hg_dagger import make_hg_dagger
+from ppl_jax.algorithms.iwr import make_iwr
+from ppl_jax.algorithms.ppl import make_ppl
+from ppl_jax.algorithms.pvp import make_pvp
+from ppl_jax.algorithms.thrifty_dagger import make_thrifty_dagger
+from ppl_jax.config import PRESETS, HParams, TrainConfig
 
-ALGORITHMS: dict[str, MakeAlgorithm] = {"ppl": make_ppl, "bc_only": make_bc_only}
+Changes = Callable[[str], Mapping[str, Any]]
+"""`changes(task)`: fields of `TrainConfig` and `HParams` that a method sets otherwise."""
 
-__all__ = ["ALGORITHMS", "Algorithm", "MakeAlgorithm"]
+
+class Method(NamedTuple):
+    """A registered method.
+
+    Attributes:
+        make: Builds it.
+        changes: Its own settings.
+        variant: It is another version of a method that is there already (a port that differs in
+            substance): left out where all methods are compared.
+    """
+
+    make: MakeAlgorithm
+    changes: Changes
+    variant: bool = False
+
+
+# what the paper gives the methods that learn from demonstrations alone
+DEMONSTRATIONS = {"driving": 20_000, "table_wiping": 10_000, "nut_assembly": 100_000}
+GAIL_STEPS = 1_000_000
+WARM_UP = {"driving": 600, "table_wiping": 300, "nut_assembly": 300}  # about two episodes
+
+
+def _bc(task: str) -> Mapping[str, Any]:
+    steps = DEMONSTRATIONS.get(task, 10_000)
+    return {
+        "total_steps": steps,
+        "demonstrations": steps,
+        "human_capacity": steps,
+        "offline_updates": 20_000,
+    }
+
+
+def _gail(task: str) -> Mapping[str, Any]:
+    steps = DEMONSTRATIONS.get(task, 10_000)
+    return {"total_steps": steps + GAIL_STEPS, "demonstrations": steps}
+
+
+def _warmed_up(task: str) -> Mapping[str, Any]:
+    return {"demonstrations": WARM_UP.get(task, 300), "offline_updates": 1000}
+
+
+_METHODS: dict[str, Method] = {}
+
+
+def register(
+    name: str,
+    make: MakeAlgorithm,
+    changes: Mapping[str, Any] | Changes | None = None,
+    variant: bool = False,
+) -> None:
+    """Make a method known by name, to `make_train`, the command line and every comparison.
+
+    Args:
+        name: As the user types it.
+        make: `make(spec, config) -> Algorithm`.
+        changes: Settings it has otherwise than the others: fields of `TrainConfig` and `HParams`,
+            or a function from the task's name to them.
+        variant: Leave it out where all methods are compared.
+
+    Raises:
+        ValueError: If the name is taken, or a field is unknown.
+    """
+    if name in _METHODS:
+        raise ValueError(f"algorithm {name!r} is registered already")
+    function = changes if callable(changes) else lambda task: changes or {}
+    known = {f.name for cls in (TrainConfig, HParams) for f in dataclasses.fields(cls)}
+    unknown = set(function("driving")) - known
+    if unknown:
+        raise ValueError(f"algorithm {name!r} changes unknown fields: {', '.join(sorted(unknown))}")
+    _METHODS[name] = Method(make, function, variant)
+
+
+register("ppl", make_ppl)
+register("bc", make_bc, _bc)
+register("gail", make_gail, _gail)
+register("hg_dagger", make_hg_dagger)
+register("ensemble_dagger", make_ensemble_dagger, _warmed_up)
+register("thrifty_dagger", make_thrifty_dagger, _warmed_up)
+register("iwr", make_iwr, _warmed_up)
+register("eil", make_eil, {"bc_weight": 0.0})
+register("haco", make_haco)
+register("haco_port", make_haco_port, {"conservative_weight": 1.0}, variant=True)
+register("pvp", make_pvp, {"bc_weight": 0.0})
+register("pvp4real", make_pvp, {"bc_weight": 1.0}, variant=True)
+
+
+def registered(variants: bool = True) -> list[str]:
+    """Names of the methods, in order."""
+    return [name for name, method in _METHODS.items() if variants or not method.variant]
+
+
+def method(name: str) -> Method:
+    """A method by name.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if name not in _METHODS:
+        raise ValueError(f"unknown algorithm {name!r}: choose one of {', '.join(_METHODS)}")
+    return _METHODS[name]
+
+
+def settings(name: str, task: str, preset: str = "default") -> tuple[TrainConfig, HParams]:
+    """A method's settings for a task: the preset's, with the method's own changes.
+
+    Raises:
+        ValueError: If the method is unknown, or the preset is not for the task.
+    """
+    config, hparams = PRESETS[preset](task)
+    changes = method(name).changes(task)
+    static = {f.name for f in dataclasses.fields(TrainConfig)}
+    config = dataclasses.replace(config, **{k: v for k, v in changes.items() if k in static})
+    hparams = dataclasses.replace(hparams, **{k: v for k, v in changes.items() if k not in static})
+    return config, hparams
+
+
+__all__ = ["Algorithm", "MakeAlgorithm", "Method", "method", "register", "registered", "settings"]

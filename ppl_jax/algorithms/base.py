@@ -12,7 +12,8 @@ import optax
 
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics
-from ppl_jax.types import Interaction, Trajectory, WorldSpec
+from ppl_jax.networks import Layers
+from ppl_jax.types import DecisionPoint, Interaction, WorldSpec
 
 PyTree = Any
 
@@ -24,26 +25,31 @@ class Algorithm(NamedTuple):
         name: As in results.
         init: `init(key) -> state`, a struct with buffers and a field `learned` that holds all
             that updates change.
-        act: `act(state, observation [O]) -> action [A]`, deterministic.
-        decide: `decide(state, trajectory, experts, hparams) -> bool`, whether the expert takes
-            over for the next block of steps; `experts` is the expert's own predicted trajectory
-            where `compares` asks for it, else None.
+        act: `act(state, key, observation [O]) -> action [A]`, what the novice does while training.
+            It is clipped to [-1, 1] before it is executed.
+        decide: `decide(state, point, hparams) -> bool`, whether the expert takes over for the next
+            block of steps.
         store: `store(state, interaction, hparams) -> state`.
-        update: `update(state, key, hparams) -> (state, metrics)`, one per environment step.
-        policy_params: `policy_params(state)`, what evaluation, saving and export use.
+        update: `update(state, key, hparams) -> (state, metrics)`.
+        policy: `policy(state) -> Layers`: the deterministic policy that is evaluated, saved and
+            exported (ReLU between layers, tanh at the end, input centred and scaled).
         uses_predictions: Whether `store` reads `interaction.predicted`.
         compares: Whether `decide` reads the expert's own prediction.
+        update_every: Steps between updates: 1, or a multiple of `decision_interval`.
+        fit: Update of the phase between demonstrations and the first step; `update` where None.
     """
 
     name: str
     init: Callable[[jax.Array], PyTree]
-    act: Callable[[PyTree, jax.Array], jax.Array]
-    decide: Callable[[PyTree, Trajectory, Trajectory | None, HParams], jax.Array]
+    act: Callable[[PyTree, jax.Array, jax.Array], jax.Array]
+    decide: Callable[[PyTree, DecisionPoint, HParams], jax.Array]
     store: Callable[[PyTree, Interaction, HParams], PyTree]
     update: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]]
-    policy_params: Callable[[PyTree], PyTree]
-    uses_predictions: bool
+    policy: Callable[[PyTree], Layers]
+    uses_predictions: bool = False
     compares: bool = False
+    update_every: int = 1
+    fit: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]] | None = None
 
 
 MakeAlgorithm = Callable[[WorldSpec, TrainConfig], Algorithm]
@@ -61,9 +67,9 @@ class Learned:
         params: What acts while training.
         opt_state: Of Adam.
         updates: Number of updates so far.
-        average: Moving average of `params` over the last thousand or so updates: what is
-            evaluated, saved and exported. One update per step on changing data leaves the last
-            parameters noisy.
+        average: Moving average of `params`. Of a policy over the last thousand or so updates: what
+            is evaluated, saved and exported (one update per step on changing data leaves the last
+            parameters noisy). Of a critic: its target network.
     """
 
     params: PyTree
@@ -78,18 +84,47 @@ def init_learned(params: PyTree) -> Learned:
 
 
 def adam_step(
-    learned: Learned, grads: PyTree, learning_rate: jax.Array | float, do: jax.Array
+    learned: Learned,
+    grads: PyTree,
+    learning_rate: jax.Array | float,
+    do: jax.Array | bool = True,
+    target_rate: jax.Array | float | None = None,
 ) -> Learned:
-    """One step of Adam with a traced learning rate where `do`, else nothing."""
+    """One step of Adam with a traced learning rate where `do`, else nothing.
+
+    Args:
+        learned: Before.
+        grads: Like `learned.params`.
+        learning_rate: Of Adam.
+        do: Scalar.
+        target_rate: tau of a target network: average <- (1 - tau) average + tau params. Where None
+            the average is a policy's, with `AVERAGING` for decay.
+    """
 
     def step(learned: Learned) -> Learned:
         updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, learned.params, updates)
-        count = learned.updates + 1.0
-        decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
+        if target_rate is None:
+            count = learned.updates + 1.0
+            decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
+        else:
+            decay = 1.0 - target_rate
         average = jax.tree.map(
             lambda old, new: decay * old + (1 - decay) * new, learned.average, params
         )
         return Learned(params, opt_state, learned.updates + 1, average)
 
     return jax.lax.cond(do, step, lambda learned: learned, learned)
+
+
+@flax.struct.dataclass
+class ActorCritic:
+    """What a method with critics learns.
+
+    Attributes:
+        actor: `Learned` of the policy.
+        critic: `Learned` of twin action values, with their target networks.
+    """
+
+    actor: Learned
+    critic: Learned

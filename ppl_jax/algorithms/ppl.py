@@ -1,8 +1,9 @@
-"""Predictive Preference Learning (the paper's Algorithm 1), and its BC-only ablation."""
+"""Predictive Preference Learning (the paper's Algorithm 1)."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -13,11 +14,20 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import COMPARING, RULES
-from ppl_jax.losses import Metrics, bc_loss, cpo_loss
-from ppl_jax.networks import make_policy
+from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.losses import (
+    NEEDS_REFERENCE,
+    Metrics,
+    bc_loss,
+    pair_likelihoods,
+    preference_loss,
+)
+from ppl_jax.networks import Layers, layers, make_policy
 from ppl_jax.preference import preference_pairs
-from ppl_jax.types import Interaction, PreferenceBatch, Trajectory, WorldSpec
+from ppl_jax.types import Interaction, PreferenceBatch, WorldSpec
+
+Reference = Callable[[jax.Array], jax.Array]
+"""A frozen policy, `reference(observation [B, O]) -> action [B, A]`."""
 
 
 @flax.struct.dataclass
@@ -28,48 +38,55 @@ class PPLState:
         learned: Parameters of the policy, its optimiser and its average.
         human_buffer: D_h of (observation [O], expert action [A]).
         preference_buffer: D_pref of `PreferenceBatch`.
+        random_actions: [2, C, A] that stand in for preferred and rejected actions of the rows of
+            `preference_buffer` in ablations; None otherwise.
     """
 
     learned: Learned
     human_buffer: RingBuffer
     preference_buffer: RingBuffer
+    random_actions: jax.Array | None
 
 
-def make_ppl(spec: WorldSpec, config: TrainConfig) -> Algorithm:
-    """PPL."""
-    return _make("ppl", spec, config, with_preferences=True)
+def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None = None) -> Algorithm:
+    """PPL: clone the expert, and prefer its action on the states the novice would have come to.
 
+        L = preference_weight L_pref + bc_weight L_bc                    (see `ppl_jax.losses`)
 
-def make_bc_only(spec: WorldSpec, config: TrainConfig) -> Algorithm:
-    """PPL without its preference loss: the same gate, data and cloning loss."""
-    return _make("bc_only", spec, config, with_preferences=False)
+    Args:
+        spec: Of the world.
+        config: Static settings; `objective`, `preferred`, `rejected` and `pair_states` make the
+            ablations.
+        reference: Reference policy of the objectives that have one.
 
-
-def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: bool) -> Algorithm:
+    Raises:
+        ValueError: If the objective needs a reference and none is given.
+    """
+    if config.objective in NEEDS_REFERENCE and reference is None:
+        raise ValueError(f"objective {config.objective!r} needs a reference policy")
     policy = make_policy(spec, config.hidden)
-    rule = RULES[config.gate]
     shifted = config.pair_states == "shifted"
+    random = "random" in (config.preferred, config.rejected)
 
     def init(key: jax.Array) -> PPLState:
         observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
         pair = PreferenceBatch(observation, action, action, observation if shifted else None)
+        rows, actions = config.preference_capacity, None
+        if random:
+            shape = (2, rows, spec.action_size)
+            actions = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0, maxval=1.0)
         return PPLState(
             learned=init_learned(policy.init(key)),
             human_buffer=buffers.init_buffer(
                 (observation, action), min(config.human_capacity, config.total_steps)
             ),
-            preference_buffer=buffers.init_buffer(
-                pair, config.preference_capacity if with_preferences else 1
-            ),
+            preference_buffer=buffers.init_buffer(pair, rows),
+            random_actions=actions,
         )
 
-    def act(state: PPLState, observation: jax.Array) -> jax.Array:
+    def act(state: PPLState, key: jax.Array, observation: jax.Array) -> jax.Array:
+        del key
         return policy.apply(state.learned.params, observation)
-
-    def decide(
-        state: PPLState, trajectory: Trajectory, experts: Trajectory | None, hparams: HParams
-    ) -> jax.Array:
-        return rule(trajectory, experts, hparams, spec.observation_scale)
 
     def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
         human = buffers.add(
@@ -77,9 +94,15 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
             (step.observation[None], step.expert_action[None]),
             step.takeover[None],
         )
-        if not with_preferences:
-            return dataclasses.replace(state, human_buffer=human)
         pairs, mask = preference_pairs(step, hparams.preference_horizon, config.pair_states)
+        if state.random_actions is not None:
+            rank = jnp.cumsum(mask) - 1
+            rows = (state.preference_buffer.next + rank) % config.preference_capacity
+            preferred, rejected = state.random_actions[:, rows]
+            if config.preferred == "random":
+                pairs = dataclasses.replace(pairs, preferred_action=preferred)
+            if config.rejected == "random":
+                pairs = dataclasses.replace(pairs, rejected_action=rejected)
         return dataclasses.replace(
             state,
             human_buffer=human,
@@ -94,24 +117,32 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
         bc, metrics = bc_loss(
             policy.apply(params, observation), action, config.likelihood, config.bc_reduction
         )
-        total = hparams.bc_weight * bc
-        if with_preferences:
-            mean = policy.apply(params, pairs.observation)
-            rejected = mean
-            if pairs.rejected_observation is not None:
-                rejected = policy.apply(params, pairs.rejected_observation)
-            preference, more = cpo_loss(
-                mean,
-                pairs.preferred_action,
-                rejected,
-                pairs.rejected_action,
-                hparams.beta,
-                hparams.preference_bias,
-                config.likelihood,
-            )
-            total = total + hparams.preference_weight * has_pairs * preference
-            metrics = metrics | more
-        return total, metrics
+
+        def means(apply: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
+            at_preferred = apply(pairs.observation)
+            if pairs.rejected_observation is None:
+                return at_preferred, at_preferred
+            return at_preferred, apply(pairs.rejected_observation)
+
+        preferred_mean, rejected_mean = means(lambda observation: policy.apply(params, observation))
+        compared = pair_likelihoods(
+            preferred_mean,
+            pairs.preferred_action,
+            rejected_mean,
+            pairs.rejected_action,
+            hparams.preference_bias,
+            config.likelihood,
+            means(reference) if reference is not None else None,
+        )
+        preference, more = preference_loss(
+            compared,
+            hparams.beta,
+            hparams.preference_bias,
+            config.objective,
+            config.objective_target,
+        )
+        total = hparams.bc_weight * bc + hparams.preference_weight * has_pairs * preference
+        return total, metrics | more
 
     def update(state: PPLState, key: jax.Array, hparams: HParams) -> tuple[PPLState, Metrics]:
         key_human, key_pairs = jax.random.split(key)
@@ -125,10 +156,17 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, with_preferences: boo
         learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
         return dataclasses.replace(state, learned=learned), metrics
 
-    def policy_params(state: PPLState) -> Any:
-        return state.learned.average
+    def policy_layers(state: PPLState) -> Layers:
+        return layers(state.learned.average)
 
-    compares = config.gate in COMPARING
     return Algorithm(
-        name, init, act, decide, store, update, policy_params, with_preferences, compares
+        "ppl",
+        init,
+        act,
+        make_gate(config.gate, spec.observation_scale),
+        store,
+        update,
+        policy_layers,
+        uses_predictions=True,
+        compares=config.gate in COMPARING,
     )

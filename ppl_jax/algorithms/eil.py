@@ -1,0 +1,228 @@
+"""Expert Intervention Learning (Spencer et al. 2020)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_learned
+from ppl_jax.buffers import RingBuffer
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.distributions import log_likelihood
+from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.losses import Metrics
+from ppl_jax.networks import Layers, layers, make_critic, make_policy
+from ppl_jax.types import Interaction, WorldSpec
+
+OTHERS = 3  # uniform random actions that the expert's is held against
+POLICY_DELAY = 2
+
+
+@flax.struct.dataclass
+class Judged:
+    """A step of the novice: `good` if no intervention followed within the window."""
+
+    observation: jax.Array
+    action: jax.Array
+    good: jax.Array
+
+
+@flax.struct.dataclass
+class Waiting:
+    """The novice's last steps, not judged yet, newest last.
+
+    Attributes:
+        observation, action: [W, O], [W, A].
+        count: How many of the last rows are filled.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    count: jax.Array
+
+
+@flax.struct.dataclass
+class EILState:
+    """What is learnt, and from what.
+
+    Attributes:
+        learned: Policy and twin action values (without targets: nothing is bootstrapped).
+        human_buffer: (observation, expert's action, novice's action) under the expert's control.
+        robot_buffer: `Judged` steps of the novice.
+        waiting: Those still to be judged.
+    """
+
+    learned: ActorCritic
+    human_buffer: RingBuffer
+    robot_buffer: RingBuffer
+    waiting: Waiting
+
+
+def judge(robot: RingBuffer, waiting: Waiting, step: Interaction) -> tuple[RingBuffer, Waiting]:
+    """Take one step in: the last W before an intervention are bad, all others good.
+
+    A step is judged once W more have gone by, its episode has ended, or the expert has taken over.
+    """
+    window = waiting.action.shape[0]
+    rows = jnp.arange(window + 1)
+    filled = (rows >= window - waiting.count) & (rows < window)
+    done = step.terminated | step.truncated
+    novice = ~step.takeover
+    oldest = filled & (rows == 0)
+    ended = filled | (rows == window)  # the present step too
+    chosen = jnp.where(step.takeover_start, filled, novice & jnp.where(done, ended, oldest))
+    observation = jnp.concatenate([waiting.observation, step.observation[None]])
+    action = jnp.concatenate([waiting.action, step.executed_action[None]])
+    good = jnp.broadcast_to(~step.takeover_start, chosen.shape)
+    robot = buffers.add(robot, Judged(observation, action, good), chosen)
+    count = jnp.where(novice & ~done, jnp.minimum(waiting.count + 1, window), 0)
+    kept = Waiting(
+        jnp.where(novice, observation[1:], waiting.observation),
+        jnp.where(novice, action[1:], waiting.action),
+        count,
+    )
+    return robot, kept
+
+
+def hinge_losses(
+    judged_value: jax.Array,
+    good: jax.Array,
+    expert_value: jax.Array,
+    other_values: jax.Array,
+    distance: jax.Array,
+    margin: jax.Array | float,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The three terms, summed over critics; values count as good, where EIL's are costs.
+
+        l_good = E[ good max(0, m - Q(s, a)) ]
+        l_bad  = E[ (1 - good) max(0, m + Q(s, a)) ]
+        l_C    = E[ max(0, m |a_h - a'| - (Q(s, a_h) - Q(s, a'))) ],  a' the novice's and random
+
+    With m = 0, Q = 0 has no loss and nothing is learnt (a public port does that). The margin of the
+    last grows with the distance because actions here are continuous: near ones are as good.
+
+    Args:
+        judged_value: [K, B] of the novice's steps.
+        good: [B].
+        expert_value: [K, B] of the expert's steps.
+        other_values, distance: [K, N, B] and [N, B], of the actions a'.
+        margin: m.
+    """
+    good_loss = jnp.sum(jnp.mean(good * jax.nn.relu(margin - judged_value), -1))
+    bad_loss = jnp.sum(jnp.mean((1.0 - good) * jax.nn.relu(margin + judged_value), -1))
+    gap = expert_value[:, None] - other_values
+    compared = jnp.sum(jnp.mean(jax.nn.relu(margin * distance - gap), (-2, -1)))
+    return good_loss, bad_loss, compared
+
+
+def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """EIL: being left alone says that a step was good enough, an intervention that it was not.
+
+        L_Q = l_good + l_bad + l_C (`hinge_losses`),  L_mu = -E[ Q_1(s, mu(s)) ]
+
+    The window before an intervention that counts as bad is one decision interval. The published
+    method picks from a library of actions; here the policy climbs Q, and l_C compares with random
+    actions in the library's place.
+    """
+    policy, critic = make_policy(spec, config.hidden), make_critic(spec, config.hidden, 2)
+    half = config.batch_size // 2
+
+    def init(key: jax.Array) -> EILState:
+        key_actor, key_critic = jax.random.split(key)
+        observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+        rows, window = min(config.human_capacity, config.total_steps), config.decision_interval
+        return EILState(
+            learned=ActorCritic(
+                init_learned(policy.init(key_actor)), init_learned(critic.init(key_critic))
+            ),
+            human_buffer=buffers.init_buffer((observation, action, action), rows),
+            robot_buffer=buffers.init_buffer(
+                Judged(observation, action, jnp.zeros((), bool)), rows
+            ),
+            waiting=Waiting(
+                jnp.zeros((window, spec.observation_size)),
+                jnp.zeros((window, spec.action_size)),
+                jnp.zeros((), jnp.int32),
+            ),
+        )
+
+    def act(state: EILState, key: jax.Array, observation: jax.Array) -> jax.Array:
+        del key
+        return policy.apply(state.learned.actor.params, observation)
+
+    def store(state: EILState, step: Interaction, hparams: HParams) -> EILState:
+        del hparams
+        item = (step.observation[None], step.expert_action[None], step.novice_action[None])
+        robot, waiting = judge(state.robot_buffer, state.waiting, step)
+        return dataclasses.replace(
+            state,
+            human_buffer=buffers.add(state.human_buffer, item, step.takeover[None]),
+            robot_buffer=robot,
+            waiting=waiting,
+        )
+
+    def critic_loss(
+        params: Any, human: Any, judged: Judged, weight: jax.Array, others: jax.Array, margin: Any
+    ) -> tuple[jax.Array, Metrics]:
+        observation, expert_action, _ = human
+        size = (OTHERS + 1, *observation.shape)
+        good, bad, compared = hinge_losses(
+            critic.apply(params, judged.observation, judged.action),
+            judged.good,
+            critic.apply(params, observation, expert_action),
+            critic.apply(params, jnp.broadcast_to(observation, size), others),
+            jnp.sqrt(jnp.sum((others - expert_action) ** 2, -1)),
+            margin,
+        )
+        metrics = {"loss_good": good, "loss_bad": bad, "loss_compared": compared}
+        return weight * (good + bad) + compared, metrics
+
+    def actor_loss(
+        params: Any, critics: Any, human: Any, judged: Judged, weight: jax.Array, hparams: HParams
+    ) -> jax.Array:
+        observation, expert_action, _ = human
+        observation = jnp.concatenate([observation, judged.observation])
+        weight = jnp.concatenate([jnp.ones(half), weight * jnp.ones(half)])
+        action = policy.apply(params, observation)
+        value = critic.apply(critics, observation, action)[0]
+        cloned = jnp.mean(log_likelihood(action[:half], expert_action, config.likelihood))
+        return -jnp.mean(weight * value) - hparams.bc_weight * cloned
+
+    def update(state: EILState, key: jax.Array, hparams: HParams) -> tuple[EILState, Metrics]:
+        key_human, key_robot, key_others = jax.random.split(key, 3)
+        human = buffers.sample(state.human_buffer, key_human, half)
+        judged = buffers.sample(state.robot_buffer, key_robot, half)
+        has_human = buffers.size(state.human_buffer) > 0
+        weight = (buffers.size(state.robot_buffer) > 0).astype(jnp.float32)
+        random = jax.random.uniform(key_others, (OTHERS, *human[1].shape), minval=-1.0, maxval=1.0)
+        others = jnp.concatenate([human[2][None], random])
+
+        def loss(params: Any) -> tuple[jax.Array, Metrics]:
+            return critic_loss(params, human, judged, weight, others, hparams.margin)
+
+        actor, critics = state.learned.actor, state.learned.critic
+        grads, metrics = jax.grad(loss, has_aux=True)(critics.params)
+        critics = adam_step(critics, grads, hparams.learning_rate, has_human, 1.0)
+
+        def improve(actor: Any) -> Any:
+            grads = jax.grad(actor_loss)(
+                actor.params, critics.params, human, judged, weight, hparams
+            )
+            return adam_step(actor, grads, hparams.learning_rate)
+
+        turn = has_human & (critics.updates % POLICY_DELAY == 0)
+        actor = jax.lax.cond(turn, improve, lambda actor: actor, actor)
+        learned = ActorCritic(actor, critics)
+        return dataclasses.replace(state, learned=learned), metrics
+
+    def policy_layers(state: EILState) -> Layers:
+        return layers(state.learned.actor.average)
+
+    gate = make_gate(config.gate, spec.observation_scale)
+    compares = config.gate in COMPARING
+    return Algorithm("eil", init, act, gate, store, update, policy_layers, compares=compares)

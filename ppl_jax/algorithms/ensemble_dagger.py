@@ -1,0 +1,129 @@
+"""Ensemble-DAgger (Menda et al. 2019): the novice itself asks for help."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.buffers import RingBuffer
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.losses import Metrics, bc_loss
+from ppl_jax.networks import Ensemble, Layers, ensemble_layers, make_ensemble
+from ppl_jax.types import DecisionPoint, Interaction, WorldSpec
+
+
+@flax.struct.dataclass
+class Bootstrap:
+    """Data of an ensemble whose members each have a data set of their own.
+
+    Attributes:
+        buffer: Of (observation [O], expert action [A]).
+        copies: [C, K] how often row c is in member k's data set: Poisson(1), the limit of
+            drawing as many rows with replacement (online bagging, Oza and Russell 2001).
+    """
+
+    buffer: RingBuffer
+    copies: jax.Array
+
+
+@flax.struct.dataclass
+class EnsembleState:
+    """What is learnt, and from what.
+
+    Attributes:
+        learned: Policies with a leading [K] axis.
+        human: D_h with its bootstraps.
+    """
+
+    learned: Learned
+    human: Bootstrap
+
+
+def init_bootstrap(key: jax.Array, spec: WorldSpec, config: TrainConfig) -> Bootstrap:
+    """Empty data sets; which row goes to which member how often is drawn beforehand."""
+    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    rows = min(config.human_capacity, config.total_steps)
+    copies = jax.random.poisson(key, 1.0, (rows, config.members)).astype(jnp.float32)
+    return Bootstrap(buffers.init_buffer(item, rows), copies)
+
+
+def add_human(human: Bootstrap, step: Interaction) -> Bootstrap:
+    """Store a step if the expert is in control."""
+    item = (step.observation[None], step.expert_action[None])
+    return dataclasses.replace(human, buffer=buffers.add(human.buffer, item, step.takeover[None]))
+
+
+def clone_members(
+    ensemble: Ensemble,
+    learned: Learned,
+    human: Bootstrap,
+    key: jax.Array,
+    hparams: HParams,
+    config: TrainConfig,
+) -> tuple[Learned, Metrics]:
+    """One update: every member draws a batch of its own from a data set of its own."""
+    count = buffers.size(human.buffer)
+    shape = (config.members, config.batch_size)
+    rows = jax.random.randint(key, shape, 0, jnp.maximum(count, 1))
+    observation, action = jax.tree.map(lambda leaf: leaf[rows], human.buffer.data)  # [K, B, ...]
+    weight = jnp.take_along_axis(human.copies.T, rows, axis=1)
+    weight = weight / jnp.maximum(jnp.mean(weight, -1, keepdims=True), 1e-9)
+
+    def loss(params: Any) -> tuple[jax.Array, Metrics]:
+        mean = ensemble.each(params, observation)
+        each, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction, weight)
+        return config.members * each, metrics  # a member's gradient is what it were alone
+
+    grads, metrics = jax.grad(loss, has_aux=True)(learned.params)
+    return adam_step(learned, grads, hparams.learning_rate, count > 0), metrics
+
+
+def doubt(ensemble: Ensemble, params: Any, observation: jax.Array) -> jax.Array:
+    """Variance of the members' actions, averaged over action dimensions, [..., O] -> [...]."""
+    return jnp.mean(jnp.var(ensemble.members(params, observation), axis=0), -1)
+
+
+def make_ensemble_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """Ensemble-DAgger: the novice acts where it is sure and agrees with the expert.
+
+        novice in control  iff  doubt(s) <= max_doubt  and  |a_n - a_h|^2 <= max_discrepancy
+
+    with a_n the ensemble's action. Only steps under the expert's control are learnt from, the
+    demonstrations at the start included, and count as human data.
+    """
+    ensemble = make_ensemble(spec, config.hidden, config.members)
+
+    def init(key: jax.Array) -> EnsembleState:
+        key_params, key_data = jax.random.split(key)
+        learned = init_learned(ensemble.init(key_params))
+        return EnsembleState(learned, init_bootstrap(key_data, spec, config))
+
+    def act(state: EnsembleState, key: jax.Array, observation: jax.Array) -> jax.Array:
+        del key
+        return ensemble.apply(state.learned.params, observation)
+
+    def decide(state: EnsembleState, point: DecisionPoint, hparams: HParams) -> jax.Array:
+        unsure = doubt(ensemble, state.learned.params, point.observation) > hparams.max_doubt
+        apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
+        return unsure | (apart > hparams.max_discrepancy)
+
+    def store(state: EnsembleState, step: Interaction, hparams: HParams) -> EnsembleState:
+        del hparams
+        return dataclasses.replace(state, human=add_human(state.human, step))
+
+    def update(
+        state: EnsembleState, key: jax.Array, hparams: HParams
+    ) -> tuple[EnsembleState, Metrics]:
+        learned, metrics = clone_members(ensemble, state.learned, state.human, key, hparams, config)
+        return dataclasses.replace(state, learned=learned), metrics
+
+    def policy_layers(state: EnsembleState) -> Layers:
+        return ensemble_layers(state.learned.average)
+
+    return Algorithm("ensemble_dagger", init, act, decide, store, update, policy_layers)

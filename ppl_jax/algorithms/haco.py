@@ -1,0 +1,195 @@
+"""Human-AI Copilot Optimization (Li et al. 2022)."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay
+from ppl_jax.buffers import SplitBuffer
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.distributions import squashed_gaussian
+from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.losses import Metrics
+from ppl_jax.networks import Layers, layers, make_critic, make_raw
+from ppl_jax.types import Interaction, WorldSpec
+
+
+@flax.struct.dataclass
+class HACOLearned:
+    """What updates change.
+
+    Attributes:
+        actor: `Learned` of a squashed Gaussian: its network gives mean and log standard deviation.
+        value: Of twin proxy values Q, with target networks.
+        cost: Of twin values Q_int of the intervention cost, with target networks.
+        log_alpha: Of the entropy's temperature.
+    """
+
+    actor: Learned
+    value: Learned
+    cost: Learned
+    log_alpha: Learned
+
+
+@flax.struct.dataclass
+class HACOState:
+    """What is learnt, and from what."""
+
+    learned: HACOLearned
+    replay: SplitBuffer
+
+
+def intervention_cost(expert_action: jax.Array, novice_action: jax.Array) -> jax.Array:
+    """C = 1 - cos(a_h, a_n) in [0, 2]; 0 where either is zero. [..., A] -> [...]."""
+    norms = jnp.linalg.norm(expert_action, axis=-1) * jnp.linalg.norm(novice_action, axis=-1)
+    dot = jnp.sum(expert_action * novice_action, -1)
+    return jnp.where(norms < 1e-6, 0.0, 1.0 - dot / jnp.maximum(norms, 1e-6))
+
+
+def proxy_loss(
+    executed_value: jax.Array,
+    novice_value: jax.Array,
+    target: jax.Array,
+    takeover: jax.Array,
+    weight: jax.Array,
+    conservative_weight: jax.Array | float,
+) -> jax.Array:
+    """E[1/2 (Q(s, a_b) - y)^2 - c I (Q(s, a_b) - Q(s, a_n))], summed over critics [K, B]."""
+    td = 0.5 * (executed_value - jax.lax.stop_gradient(target)) ** 2
+    raised = conservative_weight * takeover * (executed_value - novice_value)
+    return jnp.sum(jnp.mean(weight * (td - raised), -1))
+
+
+def make_haco(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """HACO: soft actor-critic without a reward, and a price on being overruled.
+
+        y     = gamma (1 - terminated) [min_k Q'_k(s', a') - alpha log pi(a'|s')],  a' ~ pi(s')
+        y_int = C + gamma (1 - terminated) min_k Q'int_k(s', a')
+        L_Q   = E[1/2 (Q(s, a_b) - y)^2 - c I (Q(s, a_b) - Q(s, a_n))]
+        L_int = E[1/2 (Q_int(s, a_n) - y_int)^2]
+        L_pi  = E[alpha log pi(a|s) - min_k Q_k(s, a) + min_k Qint_k(s, a)],  a ~ pi(s)
+
+    C = 1 - cos(a_h, a_n) is paid where the expert takes over, in that step alone. Batches are one
+    half of the expert's steps and one half of the novice's. alpha is tuned to an entropy of -A.
+    """
+    return _make("haco", spec, config, ported=False)
+
+
+def make_haco_port(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """HACO as the PVP4Real repository ports it.
+
+    C is paid in every step under the expert's control, Q_int is learnt at the executed action,
+    batches are drawn from all steps alike (and c is 1: `conservative_weight`).
+    """
+    return _make("haco_port", spec, config, ported=True)
+
+
+def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algorithm:
+    actions = spec.action_size
+    network = make_raw(spec, config.hidden, 2 * actions)
+    critic = make_critic(spec, config.hidden, 2)
+    sample = buffers.sample_both if ported else buffers.sample_split
+
+    def init(key: jax.Array) -> HACOState:
+        key_actor, key_value, key_cost = jax.random.split(key, 3)
+        learned = HACOLearned(
+            actor=init_learned(network.init(key_actor)),
+            value=init_learned(critic.init(key_value)),
+            cost=init_learned(critic.init(key_cost)),
+            log_alpha=init_learned(jnp.zeros(())),
+        )
+        return HACOState(learned, init_replay(spec, config))
+
+    def propose(params: Any, key: jax.Array, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean, log_std = jnp.split(network.apply(params, observation), 2, -1)
+        return squashed_gaussian(key, mean, log_std)
+
+    def act(state: HACOState, key: jax.Array, observation: jax.Array) -> jax.Array:
+        return propose(state.learned.actor.params, key, observation)[0]
+
+    def store(state: HACOState, step: Interaction, hparams: HParams) -> HACOState:
+        del hparams
+        return dataclasses.replace(state, replay=add_step(state.replay, step))
+
+    def value_loss(
+        params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array, hparams: HParams
+    ) -> jax.Array:
+        executed = critic.apply(params, batch.observation, batch.executed_action)
+        novices = critic.apply(params, batch.observation, batch.novice_action)
+        return proxy_loss(
+            executed, novices, target, batch.takeover, weight, hparams.conservative_weight
+        )
+
+    def cost_loss(
+        params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array
+    ) -> jax.Array:
+        at = batch.executed_action if ported else batch.novice_action
+        value = critic.apply(params, batch.observation, at)
+        each = 0.5 * (value - jax.lax.stop_gradient(target)) ** 2
+        return jnp.sum(jnp.mean(weight * each, -1))
+
+    def actor_loss(
+        params: Any,
+        learned: HACOLearned,
+        key: jax.Array,
+        observation: jax.Array,
+        weight: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        action, log_pi = propose(params, key, observation)
+        value = jnp.min(critic.apply(learned.value.params, observation, action), 0)
+        cost = jnp.min(critic.apply(learned.cost.params, observation, action), 0)
+        alpha = jnp.exp(learned.log_alpha.params)
+        loss = jnp.mean(weight * (alpha * log_pi - value + cost))
+        return loss, jnp.mean(weight * log_pi)
+
+    def update(state: HACOState, key: jax.Array, hparams: HParams) -> tuple[HACOState, Metrics]:
+        key_batch, key_next, key_actor = jax.random.split(key, 3)
+        batch, weight = sample(state.replay, key_batch, config.batch_size)
+        has_data = buffers.size(state.replay.human) > 0
+        learned = state.learned
+        step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)
+        action, log_pi = propose(learned.actor.params, key_next, batch.next_observation)
+        follows = hparams.discount * (1.0 - batch.terminated)
+        alpha = jnp.exp(learned.log_alpha.params)
+        values = critic.apply(learned.value.average, batch.next_observation, action)
+        costs = critic.apply(learned.cost.average, batch.next_observation, action)
+        paid = batch.takeover if ported else batch.takeover_start
+        price = paid * intervention_cost(batch.expert_action, batch.novice_action)
+        loss_value, grads = jax.value_and_grad(value_loss)(
+            learned.value.params,
+            batch,
+            follows * (jnp.min(values, 0) - alpha * log_pi),
+            weight,
+            hparams,
+        )
+        value = step(learned.value, grads, target_rate=hparams.target_rate)
+        loss_cost, grads = jax.value_and_grad(cost_loss)(
+            learned.cost.params, batch, price + follows * jnp.min(costs, 0), weight
+        )
+        cost = step(learned.cost, grads, target_rate=hparams.target_rate)
+        learned = dataclasses.replace(learned, value=value, cost=cost)
+        (loss_actor, mean_log_pi), grads = jax.value_and_grad(actor_loss, has_aux=True)(
+            learned.actor.params, learned, key_actor, batch.observation, weight
+        )
+        actor = step(learned.actor, grads)
+        # alpha grows while the entropy is below -A: d/d log_alpha of -log_alpha (log pi - A)
+        log_alpha = step(learned.log_alpha, -(mean_log_pi - actions))
+        learned = dataclasses.replace(learned, actor=actor, log_alpha=log_alpha)
+        metrics = {"loss_value": loss_value, "loss_cost": loss_cost, "loss_actor": loss_actor}
+        return dataclasses.replace(state, learned=learned), metrics | {"alpha": alpha}
+
+    def policy_layers(state: HACOState) -> Layers:
+        *before, (w, b) = layers(state.learned.actor.average)
+        return [*before, (w[:, :actions], b[:actions])]  # the mean alone
+
+    gate = make_gate(config.gate, spec.observation_scale)
+    compares = config.gate in COMPARING
+    return Algorithm(name, init, act, gate, store, update, policy_layers, compares=compares)

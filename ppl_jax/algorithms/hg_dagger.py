@@ -1,0 +1,20 @@
+"""HG-DAgger (Kelly et al. 2019): clone what the expert does while it is in control."""
+
+from __future__ import annotations
+
+from ppl_jax.algorithms.base import Algorithm
+from ppl_jax.algorithms.bc import make_cloner
+from ppl_jax.config import TrainConfig
+from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.types import WorldSpec
+
+
+def make_hg_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """HG-DAgger with the shared gate in the human's place.
+
+    Only (s, a_h) under the expert's control is learnt from. Updated at every step rather than
+    retrained after every episode, as all methods here are; this is PPL without its preference
+    loss.
+    """
+    gate = make_gate(config.gate, spec.observation_scale)
+    return make_cloner("hg_dagger", spec, config, gate)._replace(compares=config.gate in COMPARING)

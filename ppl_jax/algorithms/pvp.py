@@ -1,0 +1,129 @@
+"""Proxy Value Propagation (Peng et al. 2023)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_learned
+from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay
+from ppl_jax.buffers import SplitBuffer
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.distributions import log_likelihood
+from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.losses import Metrics
+from ppl_jax.networks import Layers, layers, make_critic, make_policy
+from ppl_jax.types import Interaction, WorldSpec
+
+TARGET_NOISE, NOISE_CLIP = 0.2, 0.5  # TD3's, on the target policy's action
+POLICY_DELAY = 2  # TD3's: updates of the critic per update of the actor
+
+
+@flax.struct.dataclass
+class PVPState:
+    """What is learnt, and from what.
+
+    Attributes:
+        learned: Policy and twin proxy values.
+        replay: Steps of the expert and of the novice.
+    """
+
+    learned: ActorCritic
+    replay: SplitBuffer
+
+
+def proxy_value_loss(
+    expert_value: jax.Array, novice_value: jax.Array, takeover: jax.Array, weight: jax.Array
+) -> jax.Array:
+    """L_PV = E[ I ((Q(s, a_h) - 1)^2 + (Q(s, a_n) + 1)^2) ], summed over critics [K, B].
+
+    The mean is over the whole batch, the novice's steps (I = 0) included.
+    """
+    each = (expert_value - 1.0) ** 2 + (novice_value + 1.0) ** 2
+    return jnp.sum(jnp.mean(weight * takeover * each, -1))
+
+
+def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
+    """E[(Q(s, a) - y)^2], summed over critics [K, B]; `target` [B] gets no gradient."""
+    return jnp.sum(jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2, -1))
+
+
+def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+    """PVP on TD3: the expert's actions are worth 1, what it overruled -1, and values spread.
+
+        L_Q  = L_PV + E[(Q(s, a_b) - y)^2],   y = gamma (1 - terminated) min_k Q'_k(s', mu'(s') + e)
+        L_mu = -E[ Q_1(s, mu(s)) ] + bc_weight E[ -I log pi(a_h|s) ]
+
+    No reward. Batches are one half of the expert's steps and one half of the novice's. The paper
+    has no cloning term (`bc_weight` 0); "PVP4Real" is PVP with `bc_weight` 1.
+    """
+    policy, critic = make_policy(spec, config.hidden), make_critic(spec, config.hidden, 2)
+
+    def init(key: jax.Array) -> PVPState:
+        key_actor, key_critic = jax.random.split(key)
+        learned = ActorCritic(
+            init_learned(policy.init(key_actor)), init_learned(critic.init(key_critic))
+        )
+        return PVPState(learned, init_replay(spec, config))
+
+    def act(state: PVPState, key: jax.Array, observation: jax.Array) -> jax.Array:
+        del key
+        return policy.apply(state.learned.actor.params, observation)
+
+    def store(state: PVPState, step: Interaction, hparams: HParams) -> PVPState:
+        del hparams
+        return dataclasses.replace(state, replay=add_step(state.replay, step))
+
+    def critic_loss(
+        params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array
+    ) -> tuple[jax.Array, Metrics]:
+        executed = critic.apply(params, batch.observation, batch.executed_action)
+        novices = critic.apply(params, batch.observation, batch.novice_action)
+        # where the expert is in control, what is executed is its action
+        proxy = proxy_value_loss(executed, novices, batch.takeover, weight)
+        td = td_loss(executed, target, weight)
+        return proxy + td, {"loss_proxy_value": proxy, "loss_td": td}
+
+    def actor_loss(
+        params: Any, critics: Any, batch: ReplayStep, weight: jax.Array, hparams: HParams
+    ) -> jax.Array:
+        action = policy.apply(params, batch.observation)
+        value = critic.apply(critics, batch.observation, action)[0]
+        cloned = batch.takeover * log_likelihood(action, batch.expert_action, config.likelihood)
+        return -jnp.mean(weight * (value + hparams.bc_weight * cloned))
+
+    def update(state: PVPState, key: jax.Array, hparams: HParams) -> tuple[PVPState, Metrics]:
+        key_batch, key_noise = jax.random.split(key)
+        batch, weight = buffers.sample_split(state.replay, key_batch, config.batch_size)
+        has_data = buffers.size(state.replay.human) > 0
+        actor, critics = state.learned.actor, state.learned.critic
+        noise = TARGET_NOISE * jax.random.normal(key_noise, batch.executed_action.shape)
+        following = policy.apply(actor.average, batch.next_observation)
+        following = following + jnp.clip(noise, -NOISE_CLIP, NOISE_CLIP)
+        values = critic.apply(
+            critics.average, batch.next_observation, jnp.clip(following, -1.0, 1.0)
+        )
+        target = hparams.discount * (1.0 - batch.terminated) * jnp.min(values, 0)
+        grads, metrics = jax.grad(critic_loss, has_aux=True)(critics.params, batch, target, weight)
+        critics = adam_step(critics, grads, hparams.learning_rate, has_data, hparams.target_rate)
+
+        def improve(actor: Any) -> Any:
+            grads = jax.grad(actor_loss)(actor.params, critics.params, batch, weight, hparams)
+            return adam_step(actor, grads, hparams.learning_rate)
+
+        turn = has_data & (critics.updates % POLICY_DELAY == 0)
+        actor = jax.lax.cond(turn, improve, lambda actor: actor, actor)
+        learned = ActorCritic(actor, critics)
+        return dataclasses.replace(state, learned=learned), metrics
+
+    def policy_layers(state: PVPState) -> Layers:
+        return layers(state.learned.actor.average)
+
+    gate = make_gate(config.gate, spec.observation_scale)
+    compares = config.gate in COMPARING
+    return Algorithm("pvp", init, act, gate, store, update, policy_layers, compares=compares)

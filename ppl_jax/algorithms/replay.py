@@ -1,0 +1,55 @@
+"""What methods with action values store of a step."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from ppl_jax import buffers
+from ppl_jax.buffers import SplitBuffer
+from ppl_jax.config import TrainConfig
+from ppl_jax.types import Interaction, WorldSpec
+
+
+@flax.struct.dataclass
+class ReplayStep:
+    """A step; the fields are `Interaction`'s.
+
+    Attributes:
+        next_observation: That of the same episode, at its last step too.
+        terminated: A value has nothing to follow; a step cut off by time has.
+    """
+
+    observation: jax.Array
+    next_observation: jax.Array
+    novice_action: jax.Array
+    expert_action: jax.Array
+    executed_action: jax.Array
+    takeover: jax.Array
+    takeover_start: jax.Array
+    terminated: jax.Array
+
+
+def init_replay(spec: WorldSpec, config: TrainConfig) -> SplitBuffer:
+    """Empty buffers of the expert's and the novice's steps."""
+    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    no = jnp.zeros((), bool)
+    item = ReplayStep(observation, observation, action, action, action, no, no, no)
+    rows = min(config.human_capacity, config.total_steps)
+    return buffers.init_split(item, rows, rows)
+
+
+def add_step(replay: SplitBuffer, step: Interaction) -> SplitBuffer:
+    """Store a step with whoever was in control."""
+    item = ReplayStep(
+        observation=step.observation,
+        next_observation=step.next_observation,
+        novice_action=jnp.clip(step.novice_action, -1.0, 1.0),
+        expert_action=step.expert_action,
+        executed_action=step.executed_action,
+        takeover=step.takeover,
+        takeover_start=step.takeover_start,
+        terminated=step.terminated,
+    )
+    return buffers.add_split(replay, item, step.takeover)
