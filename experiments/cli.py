@@ -153,7 +153,7 @@ class Compare:
     held_out_scenarios: str | None = None
     """Folder of recorded scenarios to evaluate on."""
     processes: int = 2
-    """Runs at the same time."""
+    """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("compare")
     """Folder of the runs and of results.csv; finished runs in it are kept."""
 
@@ -177,7 +177,7 @@ class Ablation:
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
     processes: int = 2
-    """Runs at the same time."""
+    """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("ablation")
     """Folder of the runs and of results.csv; finished runs in it are kept."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import os
 import subprocess
 import sys
 import time
@@ -75,6 +76,8 @@ def run_rows(command: Compare | Ablation, rows: Sequence[Row]) -> None:
     jobs = [(row, seed) for seed in range(command.seeds) for row in rows]
     waiting = [job for job in jobs if not (_run(command, *job) / SUMMARY).is_file()]
     running: dict[tuple[Row, int], subprocess.Popen] = {}
+    cores = _cores(command.processes)
+    held: dict[tuple[Row, int], int | None] = {}
     failed = []
     done = len(jobs) - len(waiting)
     with Progress(len(jobs), f"runs on {command.env}", done) as progress:
@@ -82,11 +85,13 @@ def run_rows(command: Compare | Ablation, rows: Sequence[Row]) -> None:
         while waiting or running:
             while waiting and len(running) < command.processes:
                 job = waiting.pop(0)
-                running[job] = _start(command, *job)
+                free = [core for core in cores if core not in held.values() or core is None]
+                held[job] = free[0]
+                running[job] = _start(command, *job, free[0])
             for job, process in list(running.items()):
                 if process.poll() is None:
                     continue
-                del running[job]
+                del running[job], held[job]
                 done += 1
                 row, seed = job
                 if process.returncode:
@@ -114,7 +119,7 @@ def _tell(log: Path) -> None:
     print(lines[-1] if lines else f"no output in {log}", file=sys.stderr)
 
 
-def _start(command: Compare | Ablation, row: Row, seed: int) -> subprocess.Popen:
+def _start(command: Compare | Ablation, row: Row, seed: int, core: int | None) -> subprocess.Popen:
     run = _run(command, row, seed)
     # the program that was called: it may have registered methods or worlds of its own
     words = [sys.executable, sys.argv[0], "train", command.env, *row.words]
@@ -127,7 +132,21 @@ def _start(command: Compare | Ablation, row: Row, seed: int) -> subprocess.Popen
         words.append("--resume")
     command.out.mkdir(parents=True, exist_ok=True)
     with open(run.with_suffix(".log"), "w") as log:
-        return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=log)
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=log)
+    if core is not None:
+        os.sched_setaffinity(process.pid, {core})
+    return process
+
+
+def _cores(processes: int) -> list[int | None]:
+    """A core for each process, where they are to share them out; else wherever they like.
+
+    Two runs that spread over the same cores slow each other down several times.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return [None] * processes
+    cores = sorted(os.sched_getaffinity(0))
+    return list(cores[:processes]) if processes == len(cores) else [None] * processes
 
 
 def _collect(command: Compare | Ablation, rows: Sequence[Row]) -> list[dict]:

@@ -72,3 +72,54 @@ class Probe(Environment):
     @staticmethod
     def scripted_expert(key, state, observation, params):
         return jnp.atleast_1d(Probe.answer(state.sign))
+
+
+@flax.struct.dataclass
+class GoalState:
+    place: jax.Array
+    time: jax.Array
+
+
+class Goal(Environment):
+    """Walk to +1, which ends the episode with success; below -1 it ends without."""
+
+    name = "goal"
+    max_episode_steps = 40
+    spec = WorldSpec(2, 1, np.zeros(2, np.float32), np.ones(2, np.float32))
+
+    def __init__(self, push=False):
+        self.push = push
+        self.default_params = ProbeParams(jnp.zeros(8))
+        self.held_out_params = ProbeParams(jnp.linspace(-0.8, 0.0, 8) if push else jnp.zeros(8))
+
+    def scenario_count(self, params):
+        return params.signs.shape[0]
+
+    def scenario_numbers(self, params):
+        return jnp.arange(params.signs.shape[0])
+
+    def reset_to(self, index, key, params):
+        return GoalState(params.signs[index], jnp.zeros((), jnp.int32))
+
+    def observe(self, state, params):
+        return jnp.stack([state.place, jnp.ones(())])
+
+    def transition(self, key, state, action, params):
+        place = state.place + 0.1 * jnp.clip(action[0], -1, 1)
+        time = state.time + 1
+        solved, lost = place >= 1.0, place <= -1.0
+        outcome = Outcome(
+            reward=0.1 * action[0],
+            terminated=solved | lost,
+            truncated=time >= self.max_episode_steps,
+            cost=lost.astype(jnp.float32),
+            success=solved,
+            unsafe=lost,
+            progress=jnp.clip(place, 0, 1),
+            speed=jnp.float32(10.0),
+        )
+        return GoalState(place, time), outcome
+
+    @staticmethod
+    def scripted_expert(key, state, observation, params):
+        return jnp.array([0.8])

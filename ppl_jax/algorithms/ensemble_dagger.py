@@ -67,9 +67,12 @@ def clone_members(
     hparams: HParams,
     config: TrainConfig,
 ) -> tuple[Learned, Metrics]:
-    """One update: every member draws a batch of its own from a data set of its own."""
+    """One update: every member draws a batch of its own from a data set of its own.
+
+    A member's batch is half a `batch_size`, near the published 100.
+    """
     count = buffers.size(human.buffer)
-    shape = (config.members, config.batch_size)
+    shape = (config.members, max(config.batch_size // 2, 1))
     rows = jax.random.randint(key, shape, 0, jnp.maximum(count, 1))
     observation, action = jax.tree.map(lambda leaf: leaf[rows], human.buffer.data)  # [K, B, ...]
     weight = jnp.take_along_axis(human.copies.T, rows, axis=1)

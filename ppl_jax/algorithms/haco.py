@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
-from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay
+from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss, td_target
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import squashed_gaussian
@@ -63,9 +63,19 @@ def proxy_loss(
     conservative_weight: jax.Array | float,
 ) -> jax.Array:
     """E[1/2 (Q(s, a_b) - y)^2 - c I (Q(s, a_b) - Q(s, a_n))], summed over critics [K, B]."""
-    td = 0.5 * (executed_value - jax.lax.stop_gradient(target)) ** 2
-    raised = conservative_weight * takeover * (executed_value - novice_value)
-    return jnp.sum(jnp.mean(weight * (td - raised), -1))
+    raised = jnp.mean(weight * takeover * (executed_value - novice_value), -1)
+    return 0.5 * td_loss(executed_value, target, weight) - conservative_weight * jnp.sum(raised)
+
+
+def policy_loss(
+    log_pi: jax.Array,
+    values: jax.Array,
+    costs: jax.Array,
+    alpha: jax.Array | float,
+    weight: jax.Array,
+) -> jax.Array:
+    """E[alpha log pi(a|s) - min_k Q_k(s, a) + min_k Qint_k(s, a)], [B], [K, B], [K, B]."""
+    return jnp.mean(weight * (alpha * log_pi - jnp.min(values, 0) + jnp.min(costs, 0)))
 
 
 def make_haco(spec: WorldSpec, config: TrainConfig) -> Algorithm:
@@ -133,8 +143,7 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
     ) -> jax.Array:
         at = batch.executed_action if ported else batch.novice_action
         value = critic.apply(params, batch.observation, at)
-        each = 0.5 * (value - jax.lax.stop_gradient(target)) ** 2
-        return jnp.sum(jnp.mean(weight * each, -1))
+        return 0.5 * td_loss(value, target, weight)
 
     def actor_loss(
         params: Any,
@@ -144,11 +153,10 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         weight: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
         action, log_pi = propose(params, key, observation)
-        value = jnp.min(critic.apply(learned.value.params, observation, action), 0)
-        cost = jnp.min(critic.apply(learned.cost.params, observation, action), 0)
+        values = critic.apply(learned.value.params, observation, action)
+        costs = critic.apply(learned.cost.params, observation, action)
         alpha = jnp.exp(learned.log_alpha.params)
-        loss = jnp.mean(weight * (alpha * log_pi - value + cost))
-        return loss, jnp.mean(weight * log_pi)
+        return policy_loss(log_pi, values, costs, alpha, weight), jnp.mean(weight * log_pi)
 
     def update(state: HACOState, key: jax.Array, hparams: HParams) -> tuple[HACOState, Metrics]:
         key_batch, key_next, key_actor = jax.random.split(key, 3)
@@ -157,7 +165,6 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         learned = state.learned
         step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)
         action, log_pi = propose(learned.actor.params, key_next, batch.next_observation)
-        follows = hparams.discount * (1.0 - batch.terminated)
         alpha = jnp.exp(learned.log_alpha.params)
         values = critic.apply(learned.value.average, batch.next_observation, action)
         costs = critic.apply(learned.cost.average, batch.next_observation, action)
@@ -166,13 +173,16 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         loss_value, grads = jax.value_and_grad(value_loss)(
             learned.value.params,
             batch,
-            follows * (jnp.min(values, 0) - alpha * log_pi),
+            td_target(values, batch.terminated, hparams.discount, entropy=-alpha * log_pi),
             weight,
             hparams,
         )
         value = step(learned.value, grads, target_rate=hparams.target_rate)
         loss_cost, grads = jax.value_and_grad(cost_loss)(
-            learned.cost.params, batch, price + follows * jnp.min(costs, 0), weight
+            learned.cost.params,
+            batch,
+            td_target(costs, batch.terminated, hparams.discount, paid=price),
+            weight,
         )
         cost = step(learned.cost, grads, target_rate=hparams.target_rate)
         learned = dataclasses.replace(learned, value=value, cost=cost)

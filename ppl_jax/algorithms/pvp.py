@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from ppl_jax import buffers
 from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_learned
-from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay
+from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss, td_target
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
@@ -48,9 +48,15 @@ def proxy_value_loss(
     return jnp.sum(jnp.mean(weight * takeover * each, -1))
 
 
-def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """E[(Q(s, a) - y)^2], summed over critics [K, B]; `target` [B] gets no gradient."""
-    return jnp.sum(jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2, -1))
+def policy_loss(
+    value: jax.Array,
+    log_pi: jax.Array,
+    takeover: jax.Array,
+    weight: jax.Array,
+    bc_weight: jax.Array | float,
+) -> jax.Array:
+    """-E[Q_1(s, mu(s)) + bc_weight I log pi(a_h|s)], [B] each; the mean is over the whole batch."""
+    return -jnp.mean(weight * (value + bc_weight * takeover * log_pi))
 
 
 def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
@@ -94,8 +100,8 @@ def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     ) -> jax.Array:
         action = policy.apply(params, batch.observation)
         value = critic.apply(critics, batch.observation, action)[0]
-        cloned = batch.takeover * log_likelihood(action, batch.expert_action, config.likelihood)
-        return -jnp.mean(weight * (value + hparams.bc_weight * cloned))
+        log_pi = log_likelihood(action, batch.expert_action, config.likelihood)
+        return policy_loss(value, log_pi, batch.takeover, weight, hparams.bc_weight)
 
     def update(state: PVPState, key: jax.Array, hparams: HParams) -> tuple[PVPState, Metrics]:
         key_batch, key_noise = jax.random.split(key)
@@ -108,7 +114,7 @@ def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         values = critic.apply(
             critics.average, batch.next_observation, jnp.clip(following, -1.0, 1.0)
         )
-        target = hparams.discount * (1.0 - batch.terminated) * jnp.min(values, 0)
+        target = td_target(values, batch.terminated, hparams.discount)
         grads, metrics = jax.grad(critic_loss, has_aux=True)(critics.params, batch, target, weight)
         critics = adam_step(critics, grads, hparams.learning_rate, has_data, hparams.target_rate)
 

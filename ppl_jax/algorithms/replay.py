@@ -31,6 +31,30 @@ class ReplayStep:
     terminated: jax.Array
 
 
+def td_target(
+    next_values: jax.Array,
+    terminated: jax.Array,
+    discount: jax.Array | float,
+    paid: jax.Array | float = 0.0,
+    entropy: jax.Array | float = 0.0,
+) -> jax.Array:
+    """y = paid + gamma (1 - terminated) (min_k Q'_k + entropy), [K, B] -> [B].
+
+    Args:
+        next_values: Of the target networks at (s', a').
+        terminated: Not where an episode was cut off by time.
+        discount: gamma.
+        paid: Reward or cost of the step, [B]; there is no reward here.
+        entropy: -alpha log pi(a'|s'), [B], of methods that have one.
+    """
+    return paid + discount * (1.0 - terminated) * (jnp.min(next_values, 0) + entropy)
+
+
+def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
+    """E[(Q(s, a) - y)^2], summed over critics [K, B]; `target` [B] gets no gradient."""
+    return jnp.sum(jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2, -1))
+
+
 def init_replay(spec: WorldSpec, config: TrainConfig) -> SplitBuffer:
     """Empty buffers of the expert's and the novice's steps."""
     observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
