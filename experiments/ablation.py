@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.compare import Row, run_rows
+from experiments.compare import Row, budget, run_rows
 
 if TYPE_CHECKING:
     from experiments.cli import Ablation
@@ -41,14 +41,13 @@ def ablation(command: Ablation) -> None:
     if command.env != "driving":
         del rows["rule-based f"]  # its predictor is a bicycle
     reference = _reference(command)
-    length = () if command.total_steps is None else ("--total-steps", str(command.total_steps))
     jobs = []
     for label, words in rows.items():
         if "dpo" in words or "ipo" in words:
             words = (*words, "--reference-policy", str(reference))
         signs = label.replace("a+", "preferred").replace("a-", "rejected").replace(",", "")
         folder = signs.replace("-", "_").replace(" ", "_").lower()
-        jobs.append(Row(label, folder, (*words, *length)))
+        jobs.append(Row(label, folder, (*words, *budget(command))))
     run_rows(command, jobs)
 
 

@@ -106,6 +106,8 @@ class Train:
     """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
     evaluate_every: int | None = None
     """Steps between evaluations and checkpoints (default: a tenth of the run)."""
+    evaluate_on: Literal["held_out", "training"] = "held_out"
+    """Scenarios that are evaluated on; choose settings by the training ones."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
@@ -183,6 +185,30 @@ class Ablation:
 
 
 @dataclasses.dataclass
+class Tune:
+    """Try the declared grid of every method, on training scenarios; one table."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: all)."""
+    seeds: int = 2
+    """Seeds 0, 1, ..."""
+    total_steps: int = 3000
+    """Environment steps of each run (bc keeps its own)."""
+    evaluate_every: int = 1000
+    """Steps between evaluations."""
+    gail_steps: int = 120_000
+    """Environment steps of gail."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    processes: int = 2
+    """Runs at the same time; as many as there are cores get one each."""
+    out: Path = Path("tune")
+    """Folder of the runs and of tuning.csv; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
 class Export:
     """Write a run's policy as one file that plain NumPy can run."""
 
@@ -228,6 +254,7 @@ Command = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Ablation, subcommand("ablation")]
+    | Annotated[Tune, subcommand("tune")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Bench, subcommand("bench")]
@@ -272,6 +299,7 @@ def run_settings(command: Train):
         reference_policy=command.reference_policy,
         scenarios=command.scenarios,
         held_out_scenarios=command.held_out_scenarios,
+        evaluate_on=command.evaluate_on,
         evaluate_every=(
             default_interval(final) if command.evaluate_every is None else command.evaluate_every
         ),
@@ -339,6 +367,12 @@ def _ablation(command: Ablation) -> None:
         print_comparison(command.out / "results.csv", paper.ABLATION)
 
 
+def _tune(command: Tune) -> None:
+    from experiments.tune import tune
+
+    tune(command)
+
+
 def _export(command: Export) -> None:
     import shutil
 
@@ -378,6 +412,7 @@ _ACTIONS = {
     Evaluate: _evaluate,
     Compare: _compare,
     Ablation: _ablation,
+    Tune: _tune,
     Export: _export,
     Render: _render,
     Bench: _bench,

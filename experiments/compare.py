@@ -18,9 +18,11 @@ from experiments.tables import write_rows
 from ppl_jax.runlog import CONFIG, EVALUATION, SUMMARY, RunFolder
 
 if TYPE_CHECKING:
-    from experiments.cli import Ablation, Compare
+    from experiments.cli import Ablation, Compare, Tune
 
-OPTIONS = ("preset", "evaluate_every", "gate", "min_return", "max_departure", "batch_size")
+    Settings = Ablation | Compare | Tune
+
+OPTIONS = ("preset", "gate", "min_return", "max_departure", "batch_size")
 OPTIONS += ("scenarios", "held_out_scenarios")
 
 
@@ -58,13 +60,23 @@ def compare(command: Compare) -> None:
             raise UserError(str(error)) from error
         words = ["--algorithm", name]
         # demonstrations are a method's own budget; the comparison's is that of the others
-        if command.total_steps is not None and "total_steps" not in changes:
-            words += ["--total-steps", str(command.total_steps)]
+        if "total_steps" not in changes:
+            words += budget(command)
         rows.append(Row(name, name, tuple(words)))
     run_rows(command, rows)
 
 
-def run_rows(command: Compare | Ablation, rows: Sequence[Row]) -> None:
+def budget(command: Settings) -> list[str]:
+    """The comparison's length and evaluations, as words of a run's command line."""
+    words = []
+    for name in ("total_steps", "evaluate_every"):
+        value = getattr(command, name)
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return words
+
+
+def run_rows(command: Settings, rows: Sequence[Row]) -> None:
     """Train every row with every seed and write results.csv of what has finished.
 
     Raises:
@@ -110,7 +122,7 @@ def run_rows(command: Compare | Ablation, rows: Sequence[Row]) -> None:
         )
 
 
-def _run(command: Compare | Ablation, row: Row, seed: int) -> Path:
+def _run(command: Settings, row: Row, seed: int) -> Path:
     return command.out / f"{row.folder}-{seed}"
 
 
@@ -119,7 +131,7 @@ def _tell(log: Path) -> None:
     print(lines[-1] if lines else f"no output in {log}", file=sys.stderr)
 
 
-def _start(command: Compare | Ablation, row: Row, seed: int, core: int | None) -> subprocess.Popen:
+def _start(command: Settings, row: Row, seed: int, core: int | None) -> subprocess.Popen:
     run = _run(command, row, seed)
     # the program that was called: it may have registered methods or worlds of its own
     words = [sys.executable, sys.argv[0], "train", command.env, *row.words]
@@ -149,7 +161,7 @@ def _cores(processes: int) -> list[int | None]:
     return list(cores[:processes]) if processes == len(cores) else [None] * processes
 
 
-def _collect(command: Compare | Ablation, rows: Sequence[Row]) -> list[dict]:
+def _collect(command: Settings, rows: Sequence[Row]) -> list[dict]:
     """One row per method, seed, evaluation and scenario."""
     found = []
     for row in rows:

@@ -54,11 +54,13 @@ def arrays_of(policy: SavedPolicy) -> SavedPolicy:
     return policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
 
 
-def evaluate_policy(env: Env, policy: SavedPolicy, step: int) -> list[EvaluationRow]:
-    """Play every held-out scenario of `env` once, without the expert."""
+def evaluate_policy(
+    env: Env, policy: SavedPolicy, step: int, on: str = "held_out"
+) -> list[EvaluationRow]:
+    """Play every held-out (or training) scenario of `env` once, without the expert."""
     policy = arrays_of(policy)
     arrays = (policy.weights, policy.obs_mean, policy.obs_scale)
-    params = env.held_out_params
+    params = env.held_out_params if on == "held_out" else env.default_params
     episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
     return rows_of(episodes, env.scenario_numbers(params), step)
 

@@ -48,6 +48,7 @@ class RunSettings:
         expert: "scripted", or a policy file.
         reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
+        evaluate_on: "held_out" or (to choose settings by) "training".
         evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
     """
 
@@ -61,6 +62,7 @@ class RunSettings:
     scenarios: str | None = None
     held_out_scenarios: str | None = None
     evaluate_every: int = EVALUATE_EVERY
+    evaluate_on: str = "held_out"
 
     def as_json(self) -> dict[str, Any]:
         """For config.json."""
@@ -73,6 +75,7 @@ class RunSettings:
             "scenarios": self.scenarios,
             "held_out_scenarios": self.held_out_scenarios,
             "evaluate_every": self.evaluate_every,
+            "evaluate_on": self.evaluate_on,
             "config": dataclasses.asdict(self.config),
             "hparams": {k: float(v) for k, v in dataclasses.asdict(self.hparams).items()},
         }
@@ -93,6 +96,7 @@ class RunSettings:
             scenarios=content["scenarios"],
             held_out_scenarios=content["held_out_scenarios"],
             evaluate_every=content["evaluate_every"],
+            evaluate_on=content["evaluate_on"],
         )
 
 
@@ -189,6 +193,12 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
         functions = make_train(env, expert, maker(settings, env), settings.config)
     except ValueError as error:
         raise UserError(str(error)) from error
+    every = functions.algorithm.update_every
+    if settings.evaluate_every % every:
+        raise UserError(
+            f"evaluate_every must be a multiple of rollout_steps ({every}) for "
+            f"{settings.algorithm}, got {settings.evaluate_every}"
+        )
     _open(folder, settings, resume)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     plan = _plan(settings.config, settings.evaluate_every)
@@ -337,7 +347,8 @@ class _Runner:
         row |= {name: float(value) for name, value in metrics.items()}
         note = f"human data {human}"
         if chunk.evaluate:
-            rows = evaluate_policy(self.env, saved_policy(self.env, layers), chunk.step)
+            policy, on = saved_policy(self.env, layers), self.settings.evaluate_on
+            rows = evaluate_policy(self.env, policy, chunk.step, on)
             scores = summarise_episodes(rows)
             self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
             row |= {f"eval/{name}": value for name, value in scores.items()}

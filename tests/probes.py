@@ -87,10 +87,8 @@ class Goal(Environment):
     max_episode_steps = 40
     spec = WorldSpec(2, 1, np.zeros(2, np.float32), np.ones(2, np.float32))
 
-    def __init__(self, push=False):
-        self.push = push
-        self.default_params = ProbeParams(jnp.zeros(8))
-        self.held_out_params = ProbeParams(jnp.linspace(-0.8, 0.0, 8) if push else jnp.zeros(8))
+    def __init__(self):
+        self.default_params = self.held_out_params = ProbeParams(jnp.zeros(2))
 
     def scenario_count(self, params):
         return params.signs.shape[0]
@@ -123,3 +121,32 @@ class Goal(Environment):
     @staticmethod
     def scripted_expert(key, state, observation, params):
         return jnp.array([0.8])
+
+
+class Balance(Goal):
+    """Keep an unstable place near 0: x' = 1.15 x + 0.4 a. The expert never strays from it."""
+
+    name = "balance"
+
+    def __init__(self):
+        self.default_params = self.held_out_params = ProbeParams(jnp.array([0.01, -0.01]))
+
+    def transition(self, key, state, action, params):
+        place = 1.15 * state.place + 0.4 * jnp.clip(action[0], -1, 1)
+        time = state.time + 1
+        lost, over = jnp.abs(place) > 1.0, time >= self.max_episode_steps
+        outcome = Outcome(
+            reward=-jnp.abs(place),
+            terminated=lost,
+            truncated=over,
+            cost=lost.astype(jnp.float32),
+            success=over & ~lost,
+            unsafe=lost,
+            progress=time / self.max_episode_steps,
+            speed=jnp.float32(10.0),
+        )
+        return GoalState(place, time), outcome
+
+    @staticmethod
+    def scripted_expert(key, state, observation, params):
+        return jnp.clip(jnp.atleast_1d(-1.15 / 0.4 * state.place), -1.0, 1.0)

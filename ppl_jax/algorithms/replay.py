@@ -38,7 +38,7 @@ def td_target(
     paid: jax.Array | float = 0.0,
     entropy: jax.Array | float = 0.0,
 ) -> jax.Array:
-    """y = paid + gamma (1 - terminated) (min_k Q'_k + entropy), [K, B] -> [B].
+    """Target y = paid + gamma (1 - terminated) (min_k Q'_k + entropy), [K, B] -> [B].
 
     Args:
         next_values: Of the target networks at (s', a').
