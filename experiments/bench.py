@@ -20,8 +20,9 @@ from envs.driving.env import make_driving
 from envs.manipulation.model import SUBSTEPS
 from experiments.runtime import device, versions
 from experiments.tables import print_table
-from ppl_jax.algorithms import ALGORITHMS
-from ppl_jax.config import PRESETS, as_arrays
+from ppl_jax import algorithms
+from ppl_jax.algorithms.ppl import make_ppl
+from ppl_jax.config import as_arrays
 from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
 
@@ -39,15 +40,27 @@ def _median_s(run: Callable[[], Any], repeats: int) -> float:
     return float(np.median(times))
 
 
-def bench(repeats: int, out: Path | None) -> dict[str, Any]:
-    """Measure and print; see the README for what the figures mean."""
+def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, Any]:
+    """Measure and print; see the README for what the figures mean.
+
+    Args:
+        repeats: Of each figure; medians are reported.
+        parts: Of "worlds", "training", "methods".
+        out: JSON file to write, or None.
+    """
     began = time.perf_counter()
     env = make_driving()
     figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
-    figures |= _environment(env, repeats) | _lookahead(env, repeats) | _training(env, repeats)
-    figures |= _gradient(env, repeats, figures["train_ms_per_step"])
-    for name in ("table_wiping", "nut_assembly"):
-        figures |= _arm(name, repeats)
+    if "worlds" in parts:
+        figures |= _environment(env, repeats) | _lookahead(env, repeats)
+        for name in ("table_wiping", "nut_assembly"):
+            figures |= _arm(name, repeats)
+    if "training" in parts:
+        figures |= _training(env, repeats)
+        figures |= _gradient(env, repeats, figures["train_ms_per_step"])
+    if "methods" in parts:
+        for name in algorithms.registered(variants=False):
+            figures |= _method(env, name, repeats)
     unit = 1 if sys.platform == "darwin" else 1024
     figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
@@ -170,13 +183,74 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
     return figures
 
 
+def _no_update(state: Any, key: jax.Array, hparams: Any) -> Any:
+    return state, {"none": jnp.zeros(())}
+
+
+def _method(env: Any, name: str, repeats: int) -> dict[str, float]:
+    """A method's step: time, share of its updates, and five seeds in one program.
+
+    GAIL's is a round of `rollout_steps` steps and its update. Five seeds are compared with five
+    runs of 10,000 steps, once for the running alone and once with compiling from nothing.
+    """
+    config, hparams = algorithms.settings(name, "driving")
+    # demonstrations in its buffers, and as many steps of its own
+    config = dataclasses.replace(config, demonstrations=STEPS, total_steps=10_000 + STEPS)
+    make, seeds = algorithms.method(name).make, 5
+
+    def program(make: Any, lanes: int) -> tuple[float, float]:
+        functions = make_train(env, env.scripted_expert, make, config)
+        steps = max(functions.algorithm.update_every, STEPS)
+        blocks = steps // config.decision_interval
+        phase = "fit" if name == "bc" else "interact"
+
+        def start(key: jax.Array) -> Any:
+            learner = functions.init(key, as_arrays(hparams))
+            return functions.run_chunk(learner, STEPS // config.decision_interval, "demonstrate")[0]
+
+        def chunk(learner: Any) -> Any:
+            return functions.run_chunk(learner, blocks, phase)[0]
+
+        keys = jax.random.split(jax.random.key(0), lanes)
+        if lanes == 1:
+            learner, chunk = jax.jit(start)(keys[0]), jax.jit(chunk, donate_argnums=0)
+        else:
+            learner = jax.jit(jax.vmap(start))(keys)
+            chunk = jax.jit(jax.vmap(chunk), donate_argnums=0)
+        began = time.perf_counter()
+        compiled = chunk.lower(learner).compile()
+        compile_s, times = time.perf_counter() - began, []
+        for _ in range(repeats + 1):
+            began = time.perf_counter()
+            learner = jax.block_until_ready(compiled(learner))
+            times.append((time.perf_counter() - began) / steps * 1e3)
+        return float(np.median(times[1:])), compile_s
+
+    cached = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        alone, compile_s = program(make, 1)
+        idle, _ = program(lambda spec, config: make(spec, config)._replace(update=_no_update), 1)
+        together, compile_together_s = program(make, seeds)
+    finally:
+        jax.config.update("jax_enable_compilation_cache", cached)
+    run, batch = 10 * alone + compile_s, 10 * together + compile_together_s  # s, of 10,000 steps
+    return {
+        f"{name}_ms_per_step": alone,
+        f"{name}_share_update": 1.0 if name == "bc" else (alone - idle) / alone,
+        f"{name}_compile_s": compile_s,
+        f"{name}_five_seeds_over_five_runs": together / (seeds * alone),
+        f"{name}_five_seeds_over_five_runs_with_compile": batch / (seeds * run),
+    }
+
+
 def _training(env: Any, repeats: int) -> dict[str, float]:
     """Milliseconds per training step, and how much of it each part takes.
 
     A part's share is what a run costs more than the same run without that part. It is the start of
     a run that is timed, where the expert is in control most and pairs cost most.
     """
-    config, hparams = PRESETS["default"]("driving")
+    config, hparams = algorithms.settings("ppl", "driving")
     config = dataclasses.replace(config, total_steps=STEPS)
     blocks = STEPS // config.decision_interval
 
@@ -194,17 +268,14 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
 
     def without(**parts: Any) -> Any:
         def make(spec: Any, config: Any) -> Any:
-            return ALGORITHMS["ppl"](spec, config)._replace(**parts)
+            return make_ppl(spec, config)._replace(**parts)
 
         return make
 
-    def no_update(state: Any, key: jax.Array, hparams: Any) -> Any:
-        return state, {"none": jnp.zeros(())}
-
-    whole = timed(ALGORITHMS["ppl"])
-    no_gradient = timed(without(update=no_update))
+    whole = timed(make_ppl)
+    no_gradient = timed(without(update=_no_update))
     no_pairs = timed(
-        without(update=no_update, store=lambda state, step, hparams: state, uses_predictions=False)
+        without(update=_no_update, store=lambda state, step, hparams: state, uses_predictions=False)
     )
     return {
         "train_ms_per_step": whole,
@@ -216,8 +287,8 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
 
 def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
     """FLOP/s of the update against a plain matrix product of its largest shape."""
-    config, hparams = PRESETS["default"]("driving")
-    algorithm = ALGORITHMS["ppl"](env.spec, config)
+    config, hparams = algorithms.settings("ppl", "driving")
+    algorithm = make_ppl(env.spec, config)
     state = algorithm.init(jax.random.key(0))
     ones = jax.tree.map(jnp.ones_like, state.human_buffer.added) * config.batch_size
     state = state.replace(

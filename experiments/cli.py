@@ -240,6 +240,8 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
+    parts: tuple[Literal["worlds", "training", "methods"], ...] = ("worlds", "training", "methods")
+    """What to measure."""
     out: Path | None = None
     """Also write the figures to this JSON file."""
 
@@ -398,7 +400,7 @@ def _bench(command: Bench) -> None:
     from experiments.runtime import start_jax
 
     start_jax()
-    bench(command.repeats, command.out)
+    bench(command.repeats, command.parts, command.out)
 
 
 def _doctor(command: Doctor) -> None:

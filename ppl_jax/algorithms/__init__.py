@@ -59,8 +59,17 @@ def _gail(task: str) -> Mapping[str, Any]:
     return {"total_steps": steps + GAIL_STEPS, "demonstrations": steps}
 
 
+# several networks see every sample; the published sizes range from 50 (Thrifty-DAgger) and 128
+# (PVP) to 1024 (HACO)
+BATCH_OF_CRITICS = 128
+
+
 def _warmed_up(task: str) -> Mapping[str, Any]:
     return {"demonstrations": WARM_UP.get(task, 300), "offline_updates": 1000}
+
+
+def _thrifty(task: str) -> Mapping[str, Any]:
+    return {**_warmed_up(task), "batch_size": BATCH_OF_CRITICS}
 
 
 _METHODS: dict[str, Method] = {}
@@ -94,18 +103,20 @@ def register(
     _METHODS[name] = Method(make, function, variant)
 
 
+_PORT = {"conservative_weight": 1.0, "batch_size": BATCH_OF_CRITICS}
+
 register("ppl", make_ppl)
 register("bc", make_bc, _bc)
 register("gail", make_gail, _gail)
 register("hg_dagger", make_hg_dagger)
 register("ensemble_dagger", make_ensemble_dagger, _warmed_up)
-register("thrifty_dagger", make_thrifty_dagger, _warmed_up)
+register("thrifty_dagger", make_thrifty_dagger, _thrifty)
 register("iwr", make_iwr, _warmed_up)
-register("eil", make_eil, {"bc_weight": 0.0})
-register("haco", make_haco)
-register("haco_port", make_haco_port, {"conservative_weight": 1.0}, variant=True)
-register("pvp", make_pvp, {"bc_weight": 0.0})
-register("pvp4real", make_pvp, {"bc_weight": 1.0}, variant=True)
+register("eil", make_eil, {"bc_weight": 0.0, "batch_size": BATCH_OF_CRITICS})
+register("haco", make_haco, {"batch_size": BATCH_OF_CRITICS})
+register("haco_port", make_haco_port, _PORT, variant=True)
+register("pvp", make_pvp, {"bc_weight": 0.0, "batch_size": BATCH_OF_CRITICS})
+register("pvp4real", make_pvp, {"batch_size": BATCH_OF_CRITICS}, variant=True)
 
 
 def registered(variants: bool = True) -> list[str]:

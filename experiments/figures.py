@@ -1,0 +1,85 @@
+"""Figures, from result files only: `python -m experiments.figures RESULTS.csv OUT.png`."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from ppl_jax.statistics import mean_interval
+
+
+def learning_curves(results: Path, out: Path, column: str = "success") -> None:
+    """Held-out success against steps and against human data, one line per method.
+
+    Bands are 95% intervals over seeds and scenarios. A method with a single evaluation is a dot.
+
+    Args:
+        results: A results.csv of `ppl compare` or `ppl ablation`.
+        out: Picture to write.
+        column: What to draw.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    with open(results, newline="") as file:
+        rows = list(csv.DictReader(file))
+    figure, (by_step, by_human) = pyplot.subplots(1, 2, figsize=(11, 4.2), sharey=True)
+    rng = np.random.default_rng(0)
+    colours = pyplot.get_cmap("tab10")
+    labels = list(dict.fromkeys(row["algorithm"] for row in rows))
+    longest = max(
+        (int(row["step"]) for row in rows if row["algorithm"] not in _OFFLINE), default=None
+    )
+    for i, label in enumerate(labels):
+        mine = [row for row in rows if row["algorithm"] == label]
+        steps = sorted({int(row["step"]) for row in mine})
+        means, lows, highs, human = [], [], [], []
+        for step in steps:
+            at = [row for row in mine if int(row["step"]) == step]
+            seeds = sorted({row["seed"] for row in at})
+            scores = [[float(r[column]) for r in at if r["seed"] == seed] for seed in seeds]
+            interval = mean_interval(np.array(scores), rng, replicates=500)
+            means.append(interval.mean)
+            lows.append(interval.low)
+            highs.append(interval.high)
+            human.append(np.mean([float(row["human_data_usage"]) for row in at]))
+        wide = 2.5 if i == 0 else 1.3
+        if label in _OFFLINE:  # another axis altogether: its end alone
+            by_human.errorbar(
+                human[-1],
+                means[-1],
+                [[means[-1] - lows[-1]], [highs[-1] - means[-1]]],
+                fmt="o",
+                color=colours(i % 10),
+                label=label,
+            )
+            continue
+        by_step.plot(steps, means, color=colours(i % 10), linewidth=wide, label=label)
+        by_step.fill_between(steps, lows, highs, color=colours(i % 10), alpha=0.12, linewidth=0)
+        by_human.plot(human, means, color=colours(i % 10), linewidth=wide, label=label)
+    if longest:
+        by_step.set_xlim(0, longest)
+    by_step.set_xlabel("environment steps")
+    by_human.set_xlabel("steps under the expert's control")
+    by_human.set_xscale("log")
+    by_step.set_ylabel(f"held-out {column}")
+    by_step.set_ylim(0, 1)
+    for axes in (by_step, by_human):
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, names = by_human.get_legend_handles_labels()
+    figure.legend(handles, names, loc="center right", frameon=False)
+    figure.tight_layout(rect=(0, 0, 0.85, 1))
+    figure.savefig(out, dpi=120)
+    pyplot.close(figure)
+
+
+_OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
+
+if __name__ == "__main__":
+    learning_curves(Path(sys.argv[1]), Path(sys.argv[2]))
