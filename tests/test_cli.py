@@ -172,6 +172,16 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(run, tmp_path)
     [
         (["train", "flying"], "unknown environment 'flying': choose one of driving"),
         (["train", "driving", "--algorithm", "magic"], "unknown algorithm 'magic': choose one of"),
+        (["train", "driving", "--objective", "dpo"], "objective 'dpo' needs a reference policy"),
+        (["train", "driving", "--reference-policy", "x.npz"], "reference_policy is for ppl with"),
+        (["train", "driving", "--demonstrations", "20000"], "demonstrations must not exceed"),
+        (
+            ["train", "driving", "--algorithm", "gail", "--evaluate-every", "30"],
+            "evaluate_every must be a multiple of rollout_steps (2000) for gail, got 30",
+        ),
+        (["compare", "driving", "--algorithms", "magic"], "unknown algorithm 'magic'"),
+        (["tune", "driving", "--algorithms", "pvp4real"], "no grid for 'pvp4real'"),
+        (["ablation", "driving", "--seeds", "0"], "seeds must be at least 1, got 0"),
         (["train", "driving", "--preference-horizon", "11"], "preference_horizon must not exceed"),
         (["train", "driving", "--preference-horizon", "0"], "preference_horizon must be at least"),
         (["train", "driving", "--beta", "-1"], "beta must not be negative, got -1"),

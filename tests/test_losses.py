@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax.losses import bc_loss, cpo_loss
+from ppl_jax.losses import bc_loss, pair_likelihoods, preference_loss
 
 RNG = np.random.default_rng(0)
 MEAN, GOOD, BAD, OTHER = (RNG.uniform(-1, 1, (7, 3)).astype(np.float32) for _ in range(4))
@@ -15,6 +15,10 @@ def energy(mean, action, kind):
     """Minus the log-likelihood, by a loop."""
     square = sum((float(m) - float(a)) ** 2 for m, a in zip(mean, action, strict=True))
     return square if kind == "gaussian" else (math.sqrt(square + 0.01) - 0.1) / 0.1
+
+
+def cpo_loss(mean, good, other, bad, beta, bias=1.0, kind="gaussian"):
+    return preference_loss(pair_likelihoods(mean, good, other, bad, bias, kind), beta, bias)
 
 
 KINDS = pytest.mark.parametrize("kind", ["gaussian", "laplace"])
@@ -27,6 +31,57 @@ def test_bc_is_a_loop_over_samples(kind, reduction):
     expected /= 3 if reduction == "mean" else 1
     loss, _ = bc_loss(MEAN, GOOD, kind, reduction)
     assert float(loss) == pytest.approx(expected, rel=1e-5)
+
+
+@KINDS
+def test_a_weighted_bc_loss(kind):
+    weight = RNG.uniform(0, 2, 7).astype(np.float32)
+    expected = sum(w * energy(m, a, kind) / 7 for w, m, a in zip(weight, MEAN, GOOD, strict=True))
+    assert float(bc_loss(MEAN, GOOD, kind, weight=weight)[0]) == pytest.approx(expected, rel=1e-5)
+
+
+@KINDS
+@pytest.mark.parametrize("bias", [0.5, 1.0])
+@pytest.mark.parametrize("target", ["pair", "library"])
+@pytest.mark.parametrize("objective", ["dpo", "ipo", "slic_hf", "imitation"])
+def test_other_objectives_are_loops_over_pairs(objective, target, bias, kind):
+    beta, expected = 0.2, 0.0
+    frozen = RNG.uniform(-1, 1, (7, 3)).astype(np.float32)
+    for m, f, good, bad in zip(MEAN, frozen, GOOD, BAD, strict=True):
+        delta = -energy(m, good, kind) + bias * energy(m, bad, kind)
+        reference = -energy(f, good, kind) + bias * energy(f, bad, kind)
+        attained = bias * energy(good, bad, kind)  # of a policy that acts as preferred
+        if objective == "dpo":
+            each = np.log1p(np.exp(-beta * (delta - reference)))
+        elif objective == "ipo":
+            aim = 1 / (2 * beta) if target == "library" else max(attained - reference, 0)
+            each = (delta - reference - aim) ** 2
+        elif objective == "slic_hf":
+            each = max(0.0, (1.0 if target == "library" else attained) - delta)
+        else:
+            each = energy(m, good, kind)
+        expected += each / 7
+    pairs = pair_likelihoods(MEAN, GOOD, MEAN, BAD, bias, kind, (frozen, frozen))
+    loss, _ = preference_loss(pairs, beta, bias, objective, target)
+    assert float(loss) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("objective", ["ipo", "slic_hf"])
+@pytest.mark.parametrize(("target", "corner"), [("library", True), ("pair", False)])
+def test_only_library_targets_drive_an_action_to_the_corner(objective, target, corner):
+    """Near actions cannot be told apart by as much as the libraries ask for."""
+    good, bad = jnp.array([[0.2, 0.0]]), jnp.array([[-0.2, 0.0]])
+
+    def loss(mean):
+        pairs = pair_likelihoods(mean, good, mean, bad, 1.0, "gaussian", (0 * good, 0 * good))
+        return preference_loss(pairs, 0.1, 1.0, objective, target)[0]
+
+    def step(mean, _):
+        return jnp.clip(mean - 0.02 * jax.grad(loss)(mean), -1.0, 1.0), None
+
+    mean = jax.lax.scan(step, jnp.zeros((1, 2)), None, length=500)[0]
+    assert (float(mean[0, 0]) > 0.99) is corner
+    assert float(mean[0, 0]) > 0.15
 
 
 @KINDS

@@ -43,6 +43,7 @@ def interaction(takeover, predicted):
         cost=zero,
         terminated=flag,
         truncated=flag,
+        success=flag,
         predicted=predicted,
     )
 

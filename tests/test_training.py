@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax.algorithms import ALGORITHMS
+from ppl_jax import algorithms, experts
+from ppl_jax.algorithms.ppl import make_ppl
 from ppl_jax.config import HParams, TrainConfig, reference, validate
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.training import make_train
@@ -27,24 +28,28 @@ HP = HParams(learning_rate=3e-3)
 def functions(dependent=True, algorithm="ppl", **changes):
     probe = Probe(dependent)
     config = dataclasses.replace(TINY, **changes)
-    return probe, make_train(probe, probe.scripted_expert, ALGORITHMS[algorithm], config)
+    return probe, make_train(
+        probe, probe.scripted_expert, algorithms.method(algorithm).make, config
+    )
 
 
 def success(probe, fns, learner):
-    params = fns.algorithm.policy_params(learner.algorithm)
-    state = learner.algorithm.replace(learned=learner.algorithm.learned.replace(params=params))
-    run = make_evaluate(probe, lambda k, s, o, p: fns.algorithm.act(state, o))
+    layers, spec = fns.algorithm.policy(learner.algorithm), probe.spec
+    policy = experts.SavedPolicy(
+        layers, "relu", "tanh", spec.observation_mean, spec.observation_scale
+    )
+    run = make_evaluate(probe, lambda k, s, o, p: experts.act(policy, o))
     return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
 
 
-@pytest.mark.parametrize("algorithm", ["ppl", "bc_only"])
+@pytest.mark.parametrize("algorithm", ["ppl", "hg_dagger"])
 @pytest.mark.parametrize("dependent", [False, True])
 def test_probe_worlds_are_solved(algorithm, dependent):
     probe, fns = functions(dependent, algorithm)
     learner, _ = jax.jit(fns.train)(jax.random.key(0), HP)
     assert success(probe, fns, learner) == 1.0
     for sign in probe.default_params.signs:
-        action = fns.algorithm.act(learner.algorithm, jnp.array([sign, 0.0, 1.0]))
+        action = fns.algorithm.act(learner.algorithm, None, jnp.array([sign, 0.0, 1.0]))
         assert float(action[0]) == pytest.approx(float(probe.answer(sign)), abs=probe.tolerance)
     assert int(learner.counters.human_data) < 400  # the expert is needed less and less
 
@@ -59,7 +64,7 @@ def test_the_released_settings_run_and_solve_the_probe():
         hidden=(32,),
         predictor="simulator",
     )
-    fns = make_train(probe, probe.scripted_expert, ALGORITHMS["ppl"], config)
+    fns = make_train(probe, probe.scripted_expert, make_ppl, config)
     hparams = hparams.replace(learning_rate=3e-3, min_return=-3.0)
     learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
     assert success(probe, fns, learner) == 1.0
@@ -68,9 +73,7 @@ def test_the_released_settings_run_and_solve_the_probe():
 def test_without_an_expert_in_reach_nothing_is_learnt():
     # a gate that never fires: no data, no update
     probe, fns = functions()
-    algorithm = fns.algorithm._replace(
-        decide=lambda state, trajectory, experts, hparams: jnp.zeros((), bool)
-    )
+    algorithm = fns.algorithm._replace(decide=lambda state, point, hparams: jnp.zeros((), bool))
     fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
     start = fns.init(jax.random.key(0), HP)
     learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
@@ -131,10 +134,10 @@ def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
 
     probe = Counting()
     config = dataclasses.replace(TINY, total_steps=5)
-    gate = make_train(probe, probe.scripted_expert, ALGORITHMS["ppl"], config).algorithm
+    gate = make_train(probe, probe.scripted_expert, make_ppl, config).algorithm
     # the expert takes over in the lanes whose observation shows +1
     gate = gate._replace(
-        decide=lambda state, trajectory, experts, hparams: trajectory.observation[0, 0] > 0,
+        decide=lambda state, point, hparams: point.trajectory.observation[0, 0] > 0,
         compares=True,
     )
     fns = make_train(probe, probe.scripted_expert, lambda spec, config: gate, config)
@@ -202,6 +205,16 @@ def test_a_diverged_run_is_flagged_and_frozen():
     [
         ({"total_steps": 0}, {}, "total_steps must be at least 1, got 0"),
         ({"total_steps": 7}, {}, "total_steps must be a multiple of decision_interval"),
+        ({"demonstrations": 7}, {}, "demonstrations must be a multiple of decision_interval"),
+        (
+            {"demonstrations": 605},
+            {},
+            "demonstrations must not exceed total_steps",
+        ),
+        ({"offline_updates": 10}, {}, "offline_updates needs demonstrations to learn from, got 10"),
+        ({}, {"discount": 1.5}, "discount must lie between 0 and 1, got 1.5"),
+        ({}, {"margin": -1.0}, "margin must not be negative, got -1"),
+        ({"members": 0}, {}, "members must be at least 1, got 0"),
         ({}, {"preference_horizon": 0}, "preference_horizon must be at least 1, got 0"),
         ({}, {"preference_horizon": 7}, "preference_horizon must not exceed prediction_horizon"),
         ({}, {"beta": -0.1}, "beta must not be negative"),
