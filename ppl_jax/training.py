@@ -117,7 +117,7 @@ def make_train(
     Args:
         env: The world.
         expert: Acts during takeovers.
-        make_algorithm: One of `ppl_jax.algorithms.ALGORITHMS`, or one's own.
+        make_algorithm: `ppl_jax.algorithms.method(name).make`, or one's own.
         config: Static settings; check them with `ppl_jax.config.validate` first.
         env_params: The world's parameters; its training ones where None.
 

@@ -28,13 +28,15 @@ class Method(NamedTuple):
 
     Attributes:
         make: Builds it.
-        changes: Its own settings.
+        changes: Settings that make it what it is.
+        tuned: Settings that a search found, for the default preset alone.
         variant: It is another version of a method that is there already (a port that differs in
             substance): left out where all methods are compared.
     """
 
     make: MakeAlgorithm
     changes: Changes
+    tuned: Mapping[str, Any]
     variant: bool = False
 
 
@@ -79,6 +81,7 @@ def register(
     name: str,
     make: MakeAlgorithm,
     changes: Mapping[str, Any] | Changes | None = None,
+    tuned: Mapping[str, Any] | None = None,
     variant: bool = False,
 ) -> None:
     """Make a method known by name, to `make_train`, the command line and every comparison.
@@ -88,6 +91,7 @@ def register(
         make: `make(spec, config) -> Algorithm`.
         changes: Settings it has otherwise than the others: fields of `TrainConfig` and `HParams`,
             or a function from the task's name to them.
+        tuned: The same, but left out by the presets that stand for somebody's published settings.
         variant: Leave it out where all methods are compared.
 
     Raises:
@@ -97,26 +101,34 @@ def register(
         raise ValueError(f"algorithm {name!r} is registered already")
     function = changes if callable(changes) else lambda task: changes or {}
     known = {f.name for cls in (TrainConfig, HParams) for f in dataclasses.fields(cls)}
-    unknown = set(function("driving")) - known
+    unknown = {*function("driving"), *(tuned or {})} - known
     if unknown:
         raise ValueError(f"algorithm {name!r} changes unknown fields: {', '.join(sorted(unknown))}")
-    _METHODS[name] = Method(make, function, variant)
+    _METHODS[name] = Method(make, function, tuned or {}, variant)
 
 
-_PORT = {"conservative_weight": 1.0, "batch_size": BATCH_OF_CRITICS}
+# `tuned` is the best of four settings each, found by `ppl tune driving --seeds 1` on training
+# scenarios after 3,000 steps (experiments/results/driving_tuning.csv), and used in every world
+_CRITICS = {"batch_size": BATCH_OF_CRITICS}
+_VALUES_ALONE = {**_CRITICS, "bc_weight": 0.0}  # no cloning term in the published losses
 
-register("ppl", make_ppl)
-register("bc", make_bc, _bc)
-register("gail", make_gail, _gail)
-register("hg_dagger", make_hg_dagger)
-register("ensemble_dagger", make_ensemble_dagger, _warmed_up)
-register("thrifty_dagger", make_thrifty_dagger, _thrifty)
-register("iwr", make_iwr, _warmed_up)
-register("eil", make_eil, {"bc_weight": 0.0, "batch_size": BATCH_OF_CRITICS})
-register("haco", make_haco, {"batch_size": BATCH_OF_CRITICS})
-register("haco_port", make_haco_port, _PORT, variant=True)
-register("pvp", make_pvp, {"bc_weight": 0.0, "batch_size": BATCH_OF_CRITICS})
-register("pvp4real", make_pvp, {"batch_size": BATCH_OF_CRITICS}, variant=True)
+register("ppl", make_ppl, tuned={"learning_rate": 1e-3})
+register("bc", make_bc, _bc, {"likelihood": "laplace"})
+register("gail", make_gail, _gail, {"survival_correction": 0.0})
+register("hg_dagger", make_hg_dagger, tuned={"likelihood": "laplace"})
+register("ensemble_dagger", make_ensemble_dagger, _warmed_up, {"max_discrepancy": 0.1})
+register(
+    "thrifty_dagger",
+    make_thrifty_dagger,
+    _thrifty,
+    {"learning_rate": 1e-3, "switch_rate": 0.05},
+)
+register("iwr", make_iwr, _warmed_up, {"likelihood": "laplace"})
+register("eil", make_eil, _VALUES_ALONE, {"margin": 1.0})
+register("haco", make_haco, _CRITICS, {"conservative_weight": 10.0})
+register("haco_port", make_haco_port, {**_CRITICS, "conservative_weight": 1.0}, variant=True)
+register("pvp", make_pvp, _VALUES_ALONE, {"discount": 0.9})
+register("pvp4real", make_pvp, _CRITICS, {"discount": 0.9}, variant=True)
 
 
 def registered(variants: bool = True) -> list[str]:
@@ -142,7 +154,9 @@ def settings(name: str, task: str, preset: str = "default") -> tuple[TrainConfig
         ValueError: If the method is unknown, or the preset is not for the task.
     """
     config, hparams = PRESETS[preset](task)
-    changes = method(name).changes(task)
+    changes = dict(method(name).changes(task))
+    if preset == "default":
+        changes |= method(name).tuned
     static = {f.name for f in dataclasses.fields(TrainConfig)}
     config = dataclasses.replace(config, **{k: v for k, v in changes.items() if k in static})
     hparams = dataclasses.replace(hparams, **{k: v for k, v in changes.items() if k not in static})
