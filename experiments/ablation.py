@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from experiments.compare import Row, budget, run_rows
+from experiments.tables import EPISODES, RESULTS
 
 if TYPE_CHECKING:
     from experiments.cli import Ablation
@@ -56,5 +57,6 @@ def _reference(command: Ablation) -> Path:
     steps = str(command.reference_steps)
     words = ("--algorithm", "bc", "--demonstrations", steps, "--total-steps", steps)
     run_rows(dataclasses.replace(command, seeds=1), [Row("reference", "reference", words)])
-    (command.out / "results.csv").unlink()
+    for name in (RESULTS, EPISODES):
+        (command.out / name).unlink()
     return command.out / "reference-0" / "policy.npz"

@@ -157,7 +157,7 @@ class Compare:
     processes: int = 2
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("compare")
-    """Folder of the runs and of results.csv; finished runs in it are kept."""
+    """Folder of the runs and result files; finished runs in it are kept."""
 
 
 @dataclasses.dataclass
@@ -181,7 +181,7 @@ class Ablation:
     processes: int = 2
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("ablation")
-    """Folder of the runs and of results.csv; finished runs in it are kept."""
+    """Folder of the runs and result files; finished runs in it are kept."""
 
 
 @dataclasses.dataclass
@@ -350,23 +350,23 @@ def _evaluate(command: Evaluate) -> None:
 def _compare(command: Compare) -> None:
     from experiments import paper
     from experiments.compare import compare
-    from experiments.tables import print_comparison
+    from experiments.tables import EPISODES, print_comparison
 
     try:
         compare(command)
     finally:
-        print_comparison(command.out / "results.csv", paper.METHODS.get(command.env, {}))
+        print_comparison(command.out / EPISODES, paper.METHODS.get(command.env, {}))
 
 
 def _ablation(command: Ablation) -> None:
     from experiments import paper
     from experiments.ablation import ablation
-    from experiments.tables import print_comparison
+    from experiments.tables import EPISODES, print_comparison
 
     try:
         ablation(command)
     finally:
-        print_comparison(command.out / "results.csv", paper.ABLATION)
+        print_comparison(command.out / EPISODES, paper.ABLATION)
 
 
 def _tune(command: Tune) -> None:

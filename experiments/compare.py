@@ -1,4 +1,4 @@
-"""Many runs side by side: all methods, or all ablations, as run folders and one results.csv."""
+"""Many runs side by side: all methods, or all ablations, as run folders and result files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from experiments.progress import Progress
 from experiments.runtime import UserError
-from experiments.tables import write_rows
+from experiments.tables import EPISODES, RESULTS, write_rows
 from ppl_jax.runlog import CONFIG, EVALUATION, SUMMARY, RunFolder
 
 if TYPE_CHECKING:
@@ -26,12 +26,15 @@ OPTIONS = ("preset", "gate", "min_return", "max_departure", "batch_size")
 OPTIONS += ("scenarios", "held_out_scenarios")
 
 
+SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
+
+
 @dataclasses.dataclass(frozen=True)
 class Row:
     """One row of a comparison.
 
     Attributes:
-        label: As in the table and in results.csv.
+        label: As in the table and in the result files.
         folder: Its runs are FOLDER-SEED.
         words: Of its command line beside environment, seed and folder.
     """
@@ -77,7 +80,7 @@ def budget(command: Settings) -> list[str]:
 
 
 def run_rows(command: Settings, rows: Sequence[Row]) -> None:
-    """Train every row with every seed and write results.csv of what has finished.
+    """Train every row with every seed and write the results of what has finished.
 
     Raises:
         UserError: If a setting is wrong or a run failed (the others go on).
@@ -112,9 +115,7 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
                 state = "FAILED" if process.returncode else "done"
                 progress.update(done, f"{row.label} seed {seed} {state}")
             time.sleep(0.2)
-    found = _collect(command, rows)
-    if found:
-        write_rows(command.out / "results.csv", found)
+    _collect(command, rows)
     if failed:
         raise UserError(
             f"these runs failed ({len(jobs) - len(failed)} of {len(jobs)} are there; the same "
@@ -161,18 +162,29 @@ def _cores(processes: int) -> list[int | None]:
     return list(cores[:processes]) if processes == len(cores) else [None] * processes
 
 
-def _collect(command: Settings, rows: Sequence[Row]) -> list[dict]:
-    """One row per method, seed, evaluation and scenario."""
-    found = []
+def _collect(command: Settings, rows: Sequence[Row]) -> None:
+    """Write results.csv (a row per run and evaluation) and episodes.csv (of each run's last)."""
+    points, episodes = [], []
     for row in rows:
         for seed in range(command.seeds):
             run = RunFolder(_run(command, row, seed))
             if not (run.path / SUMMARY).is_file():
                 continue
-            total = run.read_json(SUMMARY)["total_steps"]
+            summary, config = run.read_json(SUMMARY), run.config()
+            named = {"algorithm": row.label, "seed": seed, "total_steps": summary["total_steps"]}
+            settings = {name: f"{value:g}" for name, value in config["hparams"].items()}
             with open(run.path / EVALUATION, newline="") as file:
-                found += [
-                    {"algorithm": row.label, "seed": seed, "total_steps": total, **line}
-                    for line in csv.DictReader(file)
-                ]
-    return found
+                played = list(csv.DictReader(file))
+            for step in sorted({int(line["step"]) for line in played}):
+                at = [line for line in played if int(line["step"]) == step]
+                means = {
+                    name: f"{sum(float(line[name]) for line in at) / len(at):.6g}"
+                    for name in SCORES
+                }
+                human = {"human_data_usage": at[0]["human_data_usage"]}
+                points.append(named | {"step": step} | human | means | settings)
+            cost = {"training_cost": f"{summary['training_cost']:g}"}
+            episodes += [named | cost | line for line in at]
+    if points:
+        write_rows(command.out / RESULTS, points)
+        write_rows(command.out / EPISODES, episodes)

@@ -96,38 +96,37 @@ def show(interval: Interval, digits: int) -> str:
     return f"{interval.mean:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
 
 
-def read_comparison(path: Path) -> dict[str, dict[str, np.ndarray]]:
+RESULTS, EPISODES = "results.csv", "episodes.csv"
+COLUMNS = {"success": 2, "episodic_return": 0, "progress": 2, "episodic_cost": 2}
+
+
+def read_episodes(path: Path) -> dict[str, dict[str, np.ndarray]]:
     """Each method's last evaluation: columns as [seeds, scenarios]."""
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     found = {}
     for label in dict.fromkeys(row["algorithm"] for row in rows):
         mine = [row for row in rows if row["algorithm"] == label]
-        last = max(int(row["step"]) for row in mine)
-        mine = [row for row in mine if int(row["step"]) == last]
         seeds = sorted({int(row["seed"]) for row in mine})
         found[label] = {
             column: np.array(
                 [[float(row[column]) for row in mine if int(row["seed"]) == seed] for seed in seeds]
             )
-            for column in (*COLUMNS, "human_data_usage", "total_steps")
+            for column in (*COLUMNS, "human_data_usage", "total_steps", "training_cost")
         }
     return found
-
-
-COLUMNS = {"success": 2, "episodic_return": 0, "progress": 2, "episodic_cost": 2}
 
 
 def print_comparison(path: Path, reported: Mapping[str, Reported] | None = None) -> None:
     """Methods side by side at their last evaluation, 95% intervals over seeds and scenarios.
 
     Args:
-        path: A results.csv; nothing is printed where there is none.
+        path: An episodes.csv; nothing is printed where there is none.
         reported: The paper's own figures by row, shown beside ours.
     """
     if not path.is_file():
         return
-    found, reported = read_comparison(path), reported or {}
+    found, reported = read_episodes(path), reported or {}
     rng = np.random.default_rng(0)
     lines = []
     for label, scores in found.items():
@@ -140,10 +139,12 @@ def print_comparison(path: Path, reported: Mapping[str, Reported] | None = None)
                 f"{human.mean():.0f} ({human.mean() / total:.2f})",
                 f"{total:.0f}",
                 *[show(mean_interval(scores[c], rng), digits) for c, digits in COLUMNS.items()],
+                f"{scores['training_cost'][:, 0].mean():.0f}",
             ]
             + ([_cells(theirs)] if reported else [])
         )
     header = ["method", "seeds", "human data", "total", "success", "return", "route", "cost"]
+    header.append("cost in training")
     print_table(header + ([_PAPER] if reported else []), lines)
     if reported:
         print("* the paper's own figures, from another simulator and another expert")

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.compare import Row, budget, run_rows
 from experiments.runtime import UserError
-from experiments.tables import print_table, write_rows
+from experiments.tables import RESULTS, print_table, write_rows
 
 if TYPE_CHECKING:
     from experiments.cli import Tune
@@ -67,7 +67,7 @@ def tune(command: Tune) -> None:
             rows.append(row)
             found[row.label] = (name, point)
     run_rows(command, rows)
-    scores = _scores(command.out / "results.csv")
+    scores = _scores(command.out / RESULTS)
     table = [
         {
             "algorithm": name,

@@ -127,8 +127,15 @@ def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp
     assert "pvp" in done.stdout
     with open(out / "results.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    # methods x seeds x evaluations x scenarios
-    assert len(rows) == 2 * 2 * 2 * 2
+    assert len(rows) == 2 * 2 * 2  # methods x seeds x evaluations
+    with open(out / "episodes.csv", newline="") as file:
+        episodes = list(csv.DictReader(file))
+    assert len(episodes) == 2 * 2 * 2  # methods x seeds x scenarios
+    last = [row for row in rows if row["step"] == "40" and row["algorithm"] == "pvp"]
+    for row in last:
+        mine = [e for e in episodes if (e["algorithm"], e["seed"]) == ("pvp", row["seed"])]
+        assert float(row["success"]) == np.mean([float(e["success"]) for e in mine])
+        assert row["discount"] == "0.9"  # every hyper-parameter is a column
     before = {path: path.stat().st_mtime for path in out.rglob("summary.json")}
     assert len(before) == 4
     again = program(tmp_path, *words, code=2)
@@ -147,16 +154,16 @@ def test_every_row_of_the_ablation_runs(tmp_path):
 
 
 def test_the_paper_s_figures_stand_beside_ours_and_are_marked(tmp_path, capsys):
-    columns = ["algorithm", "seed", "total_steps", "step", "scenario", "success", "progress"]
-    columns += ["episodic_return", "episodic_cost", "length", "human_data_usage"]
+    columns = ["algorithm", "seed", "total_steps", "training_cost", "scenario", "success"]
+    columns += ["progress", "episodic_return", "episodic_cost", "length", "human_data_usage"]
     rows = []
     for algorithm, total, good in (("ppl", 100, 1), ("bc", 50, 0), ("focused", 100, 1)):
         for seed in range(2):
             for scenario in range(3):
-                values = [algorithm, seed, total, total, scenario, good, 0.5, 7, 1, 9, 30]
+                values = [algorithm, seed, total, 3, scenario, good, 0.5, 7, 1, 9, 30]
                 rows.append(dict(zip(columns, values, strict=True)))
-    tables.write_rows(tmp_path / "results.csv", rows)
-    tables.print_comparison(tmp_path / "results.csv", paper.METHODS["driving"])
+    tables.write_rows(tmp_path / "episodes.csv", rows)
+    tables.print_comparison(tmp_path / "episodes.csv", paper.METHODS["driving"])
     ppl, bc, own = capsys.readouterr().out.splitlines()[2:5]
     assert "30 (0.30)" in ppl
     assert "0.80±0.04, 329.9±13.4, 0.92±0.03" in ppl
@@ -197,5 +204,5 @@ def test_the_example_of_an_own_method_runs_from_outside(tmp_path):
     words = ["compare", "probe", "--algorithms", "ppl", "focused", "--seeds", "1"]
     words += ["--total-steps", "400", "--batch-size", "32", "--out", tmp_path / "c"]
     call(script, *words)
-    found = tables.read_comparison(tmp_path / "c" / "results.csv")
+    found = tables.read_episodes(tmp_path / "c" / "episodes.csv")
     assert np.mean(found["focused"]["success"]) > 0.4
