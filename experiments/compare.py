@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -88,6 +89,7 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
     for name in ("seeds", "processes"):
         if getattr(command, name) < 1:
             raise UserError(f"{name} must be at least 1, got {getattr(command, name)}")
+    _same_settings(command)
     jobs = [(row, seed) for seed in range(command.seeds) for row in rows]
     waiting = [job for job in jobs if not (_run(command, *job) / SUMMARY).is_file()]
     running: dict[tuple[Row, int], subprocess.Popen] = {}
@@ -123,6 +125,27 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
         )
 
 
+def _same_settings(command: Settings) -> None:
+    """Keep the settings with the runs: a folder holds runs of one kind.
+
+    Raises:
+        UserError: If the folder's runs were made with others.
+    """
+    may_differ = ("algorithms", "seeds", "processes", "out")
+    settings = {k: v for k, v in dataclasses.asdict(command).items() if k not in may_differ}
+    path = command.out / "settings.json"
+    if not path.is_file():
+        command.out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(settings, indent=2) + "\n")
+    before = json.loads(path.read_text())
+    for name, value in settings.items():
+        if before.get(name) != value:
+            raise UserError(
+                f"the runs in {str(command.out)!r} were made with {name} {before.get(name)!r}, "
+                f"asked for {value!r}: give another --out"
+            )
+
+
 def _run(command: Settings, row: Row, seed: int) -> Path:
     return command.out / f"{row.folder}-{seed}"
 
@@ -143,7 +166,6 @@ def _start(command: Settings, row: Row, seed: int, core: int | None) -> subproce
             words += [f"--{name.replace('_', '-')}", str(value)]
     if (run / CONFIG).exists():
         words.append("--resume")
-    command.out.mkdir(parents=True, exist_ok=True)
     with open(run.with_suffix(".log"), "w") as log:
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=log)
     if core is not None:

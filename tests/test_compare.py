@@ -141,6 +141,8 @@ def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp
     again = program(tmp_path, *words, code=2)
     assert {path: path.stat().st_mtime for path in out.rglob("summary.json")} == before
     assert again.stdout == done.stdout
+    other = program(tmp_path, *words[:-2], "--gate", "departs", "--out", out, code=2)
+    assert "were made with gate None, asked for 'departs': give another --out" in other.stderr
 
 
 @pytest.mark.slow
