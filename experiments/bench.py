@@ -45,7 +45,7 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
 
     Args:
         repeats: Of each figure; medians are reported.
-        parts: Of "worlds", "training", "methods".
+        parts: Of "worlds", "training", "methods", "seeds" (methods, and five seeds in one program).
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
@@ -58,9 +58,9 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     if "training" in parts:
         figures |= _training(env, repeats)
         figures |= _gradient(env, repeats, figures["train_ms_per_step"])
-    if "methods" in parts:
-        for name in algorithms.registered(variants=False):
-            figures |= _method(env, name, repeats)
+    for name in algorithms.registered(variants=False):
+        if "methods" in parts or "seeds" in parts:
+            figures |= _method(env, name, repeats, "seeds" in parts)
     unit = 1 if sys.platform == "darwin" else 1024
     figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
@@ -187,7 +187,7 @@ def _no_update(state: Any, key: jax.Array, hparams: Any) -> Any:
     return state, {"none": jnp.zeros(())}
 
 
-def _method(env: Any, name: str, repeats: int) -> dict[str, float]:
+def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, float]:
     """A method's step: time, share of its updates, and five seeds in one program.
 
     GAIL's is a round of `rollout_steps` steps and its update. Five seeds are compared with five
@@ -231,17 +231,19 @@ def _method(env: Any, name: str, repeats: int) -> dict[str, float]:
     try:
         alone, compile_s = program(make, 1)
         idle, _ = program(lambda spec, config: make(spec, config)._replace(update=_no_update), 1)
-        together, compile_together_s = program(make, seeds)
+        batch, compile_batch_s = program(make, seeds) if together else (0.0, 0.0)
     finally:
         jax.config.update("jax_enable_compilation_cache", cached)
-    run, batch = 10 * alone + compile_s, 10 * together + compile_together_s  # s, of 10,000 steps
-    return {
+    figures = {
         f"{name}_ms_per_step": alone,
         f"{name}_share_update": 1.0 if name == "bc" else (alone - idle) / alone,
         f"{name}_compile_s": compile_s,
-        f"{name}_five_seeds_over_five_runs": together / (seeds * alone),
-        f"{name}_five_seeds_over_five_runs_with_compile": batch / (seeds * run),
     }
+    if together:
+        run, whole = 10 * alone + compile_s, 10 * batch + compile_batch_s  # s, of 10,000 steps
+        figures[f"{name}_five_seeds_over_five_runs"] = batch / (seeds * alone)
+        figures[f"{name}_five_seeds_over_five_runs_with_compile"] = whole / (seeds * run)
+    return figures
 
 
 def _training(env: Any, repeats: int) -> dict[str, float]:

@@ -240,8 +240,12 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
-    parts: tuple[Literal["worlds", "training", "methods"], ...] = ("worlds", "training", "methods")
-    """What to measure."""
+    parts: tuple[Literal["worlds", "training", "methods", "seeds"], ...] = (
+        "worlds",
+        "training",
+        "methods",
+    )
+    """What to measure; seeds (methods, and five seeds of each in one program) takes long."""
     out: Path | None = None
     """Also write the figures to this JSON file."""
 
