@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.compare import Row, budget, run_rows
+from experiments.compare import Row, budget, check_counts, run_rows
 from experiments.tables import EPISODES, RESULTS
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def ablation(command: Ablation) -> None:
     Raises:
         UserError: If a setting is wrong or a run failed (the others go on).
     """
+    check_counts(command)
     rows = ROWS | LIBRARY
     if command.env != "driving":
         del rows["rule-based f"]  # its predictor is a bicycle

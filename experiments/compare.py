@@ -86,9 +86,7 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
     Raises:
         UserError: If a setting is wrong or a run failed (the others go on).
     """
-    for name in ("seeds", "processes"):
-        if getattr(command, name) < 1:
-            raise UserError(f"{name} must be at least 1, got {getattr(command, name)}")
+    check_counts(command)
     _same_settings(command)
     jobs = [(row, seed) for seed in range(command.seeds) for row in rows]
     waiting = [job for job in jobs if not (_run(command, *job) / SUMMARY).is_file()]
@@ -123,6 +121,17 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
             f"these runs failed ({len(jobs) - len(failed)} of {len(jobs)} are there; the same "
             f"command tries them again): {', '.join(failed)}"
         )
+
+
+def check_counts(command: Settings) -> None:
+    """Refuse what cannot be run.
+
+    Raises:
+        UserError: One line naming field, value and what is allowed.
+    """
+    for name in ("seeds", "processes"):
+        if getattr(command, name) < 1:
+            raise UserError(f"{name} must be at least 1, got {getattr(command, name)}")
 
 
 def _same_settings(command: Settings) -> None:
