@@ -144,6 +144,10 @@ def _same_settings(command: Settings) -> None:
     settings = {k: v for k, v in dataclasses.asdict(command).items() if k not in may_differ}
     path = command.out / "settings.json"
     if not path.is_file():
+        if any(command.out.glob(f"*/{CONFIG}")):
+            raise UserError(
+                f"{str(command.out)!r} holds runs of something else: give another --out"
+            )
         command.out.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(settings, indent=2) + "\n")
     before = json.loads(path.read_text())

@@ -142,7 +142,11 @@ def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp
     assert {path: path.stat().st_mtime for path in out.rglob("summary.json")} == before
     assert again.stdout == done.stdout
     other = program(tmp_path, *words[:-2], "--gate", "departs", "--out", out, code=2)
+    assert not (out / "broken-0" / "summary.json").exists()
     assert "were made with gate None, asked for 'departs': give another --out" in other.stderr
+    (out / "settings.json").unlink()
+    unknown = program(tmp_path, *words, code=2)
+    assert "holds runs of something else: give another --out" in unknown.stderr
 
 
 @pytest.mark.slow
