@@ -12,8 +12,6 @@ from experiments.tables import EPISODES, RESULTS
 if TYPE_CHECKING:
     from experiments.cli import Ablation
 
-REFERENCE_STEPS = 10_000  # expert steps that the reference policy of DPO and IPO clones
-
 ROWS: dict[str, tuple[str, ...]] = {
     "PPL": (),
     "imitation on a+": ("--objective", "imitation"),
@@ -54,7 +52,7 @@ def ablation(command: Ablation) -> None:
 
 
 def _reference(command: Ablation) -> Path:
-    """Clone `REFERENCE_STEPS` expert steps, once; the policy file."""
+    """Clone `reference_steps` expert steps, once; the policy file."""
     steps = str(command.reference_steps)
     words = ("--algorithm", "bc", "--demonstrations", steps, "--total-steps", steps)
     run_rows(dataclasses.replace(command, seeds=1), [Row("reference", "reference", words)])
