@@ -19,6 +19,7 @@ class SavedPolicy(NamedTuple):
         activation: Between layers: "relu" or "tanh".
         output: Of the last layer: "tanh" squashes it, "clip" clips it to [-1, 1].
         obs_mean, obs_scale: `(obs - mean) / scale` comes first.
+        log_std: [A] of the Gaussian around the action, where the policy has one, else None.
     """
 
     weights: Sequence[tuple[Any, Any]]
@@ -26,6 +27,7 @@ class SavedPolicy(NamedTuple):
     output: str
     obs_mean: Any
     obs_scale: Any
+    log_std: Any = None
 
 
 def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:

@@ -224,14 +224,14 @@ def test_gail_losses():
         advantage = delta + (0 if done[b] else 0.9 * gail.GAE_LAMBDA * advantage)
         expected.insert(0, advantage)
     np.testing.assert_allclose(
-        gail.advantages(reward, value, following, ended, done, 0.9), expected, rtol=1e-4, atol=1e-6
+        policy_gradient.advantages(reward, value, following, ended, done, 0.9, gail.GAE_LAMBDA), expected, rtol=1e-4, atol=1e-6
     )
     new, old, gain = uniform(B), uniform(B), uniform(B)
     expected = 0.0
     for b in range(B):
         ratio = np.exp(new[b] - old[b])
         expected -= min(ratio * gain[b], np.clip(ratio, 0.8, 1.2) * gain[b]) / B
-    assert float(gail.clipped_loss(new, old, gain)) == pytest.approx(expected, rel=1e-4)
+    assert float(policy_gradient.clipped_loss(new, old, gain)) == pytest.approx(expected, rel=1e-4)
 
 
 # --- networks and data ---

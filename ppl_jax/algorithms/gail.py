@@ -17,9 +17,9 @@ from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.intervention import never
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy, make_raw
+from ppl_jax.policy_gradient import advantages, clipped_loss
 from ppl_jax.types import Interaction, WorldSpec
 
-CLIP = 0.2  # PPO
 GAE_LAMBDA = 0.95
 EPOCHS = 5
 DISCRIMINATOR_UPDATES = 8  # per rollout
@@ -80,36 +80,6 @@ def imitation_reward(logit: jax.Array, correction: jax.Array | float) -> jax.Arr
     correction 1 the reward is log D - log(1 - D), the logit (Fu et al. 2018).
     """
     return jax.nn.softplus(logit) - correction * jax.nn.softplus(-logit)
-
-
-def advantages(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    done: jax.Array,
-    discount: jax.Array | float,
-) -> jax.Array:
-    """Generalised advantages, [T]; a step cut off by time is followed by its own next state.
-
-    delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)
-    A_t     = delta_t + gamma lambda (1 - done_t) A_{t+1}
-    """
-    delta = reward + discount * (1.0 - terminated) * next_value - value
-
-    def step(following: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
-        delta, done = at
-        advantage = delta + discount * GAE_LAMBDA * (1.0 - done) * following
-        return advantage, advantage
-
-    return jax.lax.scan(step, jnp.zeros(()), (delta, done), reverse=True)[1]
-
-
-def clipped_loss(log_prob: jax.Array, old_log_prob: jax.Array, advantage: jax.Array) -> jax.Array:
-    """-E[min(rho A, clip(rho, 1 - e, 1 + e) A)], rho = pi / pi_old, e = 0.2."""
-    ratio = jnp.exp(log_prob - old_log_prob)
-    clipped = jnp.clip(ratio, 1.0 - CLIP, 1.0 + CLIP)
-    return -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
 
 
 def make_gail(spec: WorldSpec, config: TrainConfig) -> Algorithm:
@@ -198,7 +168,7 @@ def make_gail(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         before = value.apply(learned.value.params, steps.observation)[..., 0]
         after = value.apply(learned.value.params, steps.next_observation)[..., 0]
         advantage = advantages(
-            reward, before, after, steps.terminated, steps.done, hparams.discount
+            reward, before, after, steps.terminated, steps.done, hparams.discount, GAE_LAMBDA
         )
         returns = advantage + before
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)

@@ -1,0 +1,627 @@
+"""PPO-Lagrangian: trains a neural expert to earn reward within a limit on cost.
+
+    max_pi J(pi)  subject to  J_C(pi) <= d          (d: mean cost per episode)
+
+by PPO on the reward's and the cost's advantages with a multiplier that rises while the cost is
+above its limit (Ray, Achiam and Amodei 2019, "Benchmarking Safe Exploration in Deep Reinforcement
+Learning"):
+
+    lambda = softplus(p),   p <- p + Adam(J_C - d)          once per batch, before the policy
+    min over theta of [ L(A) + lambda L_c(A_C) ] / (1 + lambda)
+    L(A)     = -E[ min(rho A,   clip(rho, 1 - e, 1 + e) A)   ]    A   standardised
+    L_c(A_C) =  E[ max(rho A_C, clip(rho, 1 - e, 1 + e) A_C) ]    A_C centred only
+
+As A is divided by its standard deviation s, the multiplier in units of the reward is lambda s
+(`train/multiplier` times `train/advantage_std`). Beside the published recipe: the cost's ratio is
+clipped too; the policy's updates of a batch stop at the first epoch whose divergence from the
+policy that played exceeds `max_divergence`; where no episode ended, the multiplier stays.
+
+The policy is a Gaussian around tanh of a network of the scaled observation, clipped to the action
+box where it acts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from ppl_jax.algorithms.base import Learned, adam_step, init_learned
+from ppl_jax.distributions import gaussian_log_prob, log_likelihood
+from ppl_jax.experts import SavedPolicy
+from ppl_jax.losses import Metrics
+from ppl_jax.networks import layers, make_policy, make_raw
+from ppl_jax.policy_gradient import advantages, clipped_loss, gaussian_divergence
+from ppl_jax.types import Env, Expert, PyTree
+
+LAST_LAYER = 0.01  # the policy's last layer starts so much smaller: the first actions are near 0
+LEAST_SCALE = 0.1  # of an input, in the world's own scale: what hardly varies is not blown up
+CLONING_RATE = 1e-3  # Adam, falling to 0
+CLONING_BATCH = 1024
+
+
+@flax.struct.dataclass
+class PPOHParams:
+    """Traced settings.
+
+    Attributes:
+        learning_rate: Of Adam; it falls linearly to 0 over the run.
+        discount, smoothing: gamma and GAE's lambda, of reward and of cost.
+        clip: e.
+        max_divergence: Mean KL from the policy that played at which a batch's policy updates stop.
+        max_gradient: Norm to which gradients are clipped.
+        entropy_weight: Of the policy's entropy.
+        cost_limit: d, mean cost per episode.
+        initial_multiplier, multiplier_rate: lambda at the start, and Adam's rate for p.
+        initial_std, least_std: Of the actions, at the start and at least.
+        success_bonus: Added to the reward in the step that solves the task, while training. Where
+            solving it ends the episode and a state shortly before pays every step, return alone
+            would have the policy loiter there.
+        demonstration_noise: Standard deviation of the noise under which the expert demonstrates.
+    """
+
+    learning_rate: jax.Array | float = 3e-4
+    discount: jax.Array | float = 0.99
+    smoothing: jax.Array | float = 0.95
+    clip: jax.Array | float = 0.2
+    max_divergence: jax.Array | float = 0.02
+    max_gradient: jax.Array | float = 0.5
+    entropy_weight: jax.Array | float = 0.0
+    cost_limit: jax.Array | float = 1.0
+    initial_multiplier: jax.Array | float = 1.0
+    multiplier_rate: jax.Array | float = 0.01
+    initial_std: jax.Array | float = 0.5
+    least_std: jax.Array | float = 0.05
+    success_bonus: jax.Array | float = 0.0
+    demonstration_noise: jax.Array | float = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """What sets shapes and programs.
+
+    Attributes:
+        total_steps: Environment steps, rounded up to whole batches; demonstrations not counted.
+        worlds: Stepped side by side.
+        rollout_steps: Of each world per batch.
+        epochs, minibatches: Passes over a batch, and updates per pass.
+        hidden: Widths of the hidden layers of policy and critics.
+        scaling: Inputs are centred and scaled by running statistics of what was seen, or by the
+            world's constants.
+        demonstrations: Steps of a demonstrating expert, under noise, that the policy clones first.
+        cloning_updates: Updates of that.
+        critic_batches: Batches at the start in which only the critics learn.
+    """
+
+    total_steps: int = 20_000_000
+    worlds: int = 64
+    rollout_steps: int = 256
+    epochs: int = 5
+    minibatches: int = 8
+    hidden: tuple[int, ...] = (256, 256)
+    scaling: Literal["running", "world"] = "running"
+    demonstrations: int = 0
+    cloning_updates: int = 20_000
+    critic_batches: int = 0
+
+    @property
+    def batch_steps(self) -> int:
+        """Environment steps per batch."""
+        return self.worlds * self.rollout_steps
+
+    @property
+    def batches(self) -> int:
+        """Batches of the run."""
+        return -(-self.total_steps // self.batch_steps)
+
+
+@flax.struct.dataclass
+class Running:
+    """Mean and variance of everything seen, merged batch by batch (Chan et al. 1979).
+
+    Attributes:
+        count: Values seen.
+        mean, square: Mean, and sum of squared deviations from it.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    square: jax.Array
+
+    def add(self, values: jax.Array) -> Running:
+        """With `values` [N, ...] as well."""
+        count, mean = values.shape[0], jnp.mean(values, 0)
+        square = jnp.sum((values - mean) ** 2, 0)
+        total, away = self.count + count, mean - self.mean
+        return Running(
+            total,
+            self.mean + away * (count / total),
+            self.square + square + away**2 * (self.count / total * count),
+        )
+
+    @property
+    def variance(self) -> jax.Array:
+        """Of the population; 0 before anything was seen."""
+        return self.square / jnp.maximum(self.count, 1.0)
+
+
+def no_values(shape: tuple[int, ...]) -> Running:
+    """Statistics of nothing yet."""
+    return Running(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
+
+
+@flax.struct.dataclass
+class Multiplier:
+    """lambda = softplus(p), with p's Adam.
+
+    Attributes:
+        p: Scalar.
+        opt_state: Of Adam.
+    """
+
+    p: jax.Array
+    opt_state: PyTree
+
+    @property
+    def value(self) -> jax.Array:
+        """lambda, >= 0."""
+        return jax.nn.softplus(self.p)
+
+
+_ADAM = optax.scale_by_adam()
+
+
+def init_multiplier(value: jax.Array | float) -> Multiplier:
+    """A multiplier that starts at `value` > 0: p = log(e^value - 1)."""
+    p = jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
+    return Multiplier(p, _ADAM.init(p))
+
+
+def update_multiplier(
+    multiplier: Multiplier, cost: jax.Array, limit: jax.Array, rate: jax.Array, known: jax.Array
+) -> Multiplier:
+    """One step of Adam up the gradient J_C - d of p (J_C - d), where `known`.
+
+    Args:
+        multiplier: Before.
+        cost, limit: J_C, mean cost of the episodes that ended, and d.
+        rate: Adam's.
+        known: Whether any episode ended.
+    """
+    step, opt_state = _ADAM.update(-(cost - limit), multiplier.opt_state)
+    moved = Multiplier(multiplier.p - rate * step, opt_state)
+    return jax.tree.map(lambda new, old: jnp.where(known, new, old), moved, multiplier)
+
+
+@flax.struct.dataclass
+class PPOLearned:
+    """What updates change.
+
+    Attributes:
+        policy: `Learned` of {"mean": network, "log_std": [A]}.
+        critics: `Learned` of two networks [2]: of the reward's and of the cost's value.
+        multiplier: `Multiplier`.
+        inputs: `Running` of the observations, [O].
+        returns: `Running` of the squared targets of both critics, [2]: they learn in units of
+            their root.
+    """
+
+    policy: Learned
+    critics: Learned
+    multiplier: Multiplier
+    inputs: Running
+    returns: Running
+
+
+@flax.struct.dataclass
+class Played:
+    """Sums over the running episode of each world, [W]."""
+
+    reward: jax.Array
+    cost: jax.Array
+    length: jax.Array
+
+
+@flax.struct.dataclass
+class PPOLearner:
+    """All of a run's state, one pytree.
+
+    Attributes:
+        learned: `PPOLearned`.
+        env_state: [W] worlds.
+        observation: [W, O] of them.
+        played: `Played`.
+        key: Random key.
+        hparams: `PPOHParams`.
+        batches: Batches so far.
+        diverged: A loss was not finite: what was learned stays as it was before.
+    """
+
+    learned: PPOLearned
+    env_state: PyTree
+    observation: jax.Array
+    played: Played
+    key: jax.Array
+    hparams: PPOHParams
+    batches: jax.Array
+    diverged: jax.Array
+
+
+@flax.struct.dataclass
+class Rollout:
+    """A batch of steps, [T, W] (observations [T, W, O], actions [T, W, A])."""
+
+    observation: jax.Array
+    action: jax.Array
+    final_observation: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    terminated: jax.Array
+    done: jax.Array
+    success: jax.Array
+    ended: Played  # of the episode, up to and with this step
+
+
+class PPOFunctions(NamedTuple):
+    """What `make_ppo_lagrangian` returns; all pure, jittable and vmappable.
+
+    Attributes:
+        init: `init(key, hparams) -> PPOLearner`.
+        clone: `clone(learner) -> (learner, Metrics)`: demonstrations, and the policy cloned from
+            them; where the settings name any.
+        run: `run(learner, batches) -> (learner, Metrics)` for a static number of batches; metrics
+            carry a leading [batches] axis.
+        policy: `policy(learner) -> SavedPolicy` with its `log_std`.
+    """
+
+    init: Callable[[jax.Array, PPOHParams], PPOLearner]
+    clone: Callable[[PPOLearner], tuple[PPOLearner, Metrics]]
+    run: Callable[[PPOLearner, int], tuple[PPOLearner, Metrics]]
+    policy: Callable[[PPOLearner], SavedPolicy]
+
+
+def validate(config: PPOConfig, hparams: PPOHParams) -> None:
+    """Check settings before anything compiles.
+
+    Raises:
+        ValueError: One line naming field, value and what is allowed.
+    """
+    for field in ("total_steps", "worlds", "rollout_steps", "epochs", "minibatches"):
+        if getattr(config, field) < 1:
+            raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")
+    for field in ("demonstrations", "cloning_updates", "critic_batches"):
+        if getattr(config, field) < 0:
+            raise ValueError(f"{field} must not be negative, got {getattr(config, field)}")
+    if not config.hidden or min(config.hidden) < 1:
+        raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
+    if config.batch_steps % config.minibatches:
+        raise ValueError(
+            f"minibatches must divide worlds x rollout_steps ({config.batch_steps}), got "
+            f"{config.minibatches}"
+        )
+    for name, value in dataclasses.asdict(hparams).items():
+        above = name in ("initial_multiplier", "initial_std", "least_std", "clip", "max_gradient")
+        if not (value > 0 if above else value >= 0) or not np.isfinite(value):
+            what = "positive" if above else "a number of 0 or more"
+            raise ValueError(f"{name} must be {what}, got {value}")
+    for name in ("discount", "smoothing"):
+        if getattr(hparams, name) > 1:
+            raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")
+
+
+def mean_of_ended(values: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean over the episodes that ended (0 where none did), and whether any did."""
+    count = jnp.sum(done)
+    return jnp.sum(jnp.where(done, values, 0.0)) / jnp.maximum(count, 1), count > 0
+
+
+def make_ppo_lagrangian(
+    env: Env, config: PPOConfig, env_params: PyTree | None = None, expert: Expert | None = None
+) -> PPOFunctions:
+    """Build the functions that train one expert.
+
+    Args:
+        env: Any world; without costs this is PPO.
+        config: Static settings; check them with `validate` first.
+        env_params: The world's parameters; its training ones where None.
+        expert: Demonstrates, where `config.demonstrations` asks for it.
+    """
+    params = env.default_params if env_params is None else env_params
+    spec = env.spec
+    size = spec.observation_size
+    plain = spec._replace(
+        observation_mean=np.zeros(size, np.float32), observation_scale=np.ones(size, np.float32)
+    )
+    policy, critic = make_policy(plain, config.hidden), make_raw(plain, config.hidden, 1)
+    rows = config.batch_steps // config.minibatches
+
+    def init(key: jax.Array, hparams: PPOHParams) -> PPOLearner:
+        key, key_policy, key_critics, key_env = jax.random.split(key, 4)
+        hparams = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
+        network = policy.init(key_policy)
+        last = f"Dense_{len(config.hidden)}"
+        network["params"][last]["kernel"] = LAST_LAYER * network["params"][last]["kernel"]
+        log_std = jnp.broadcast_to(jnp.log(hparams.initial_std), (spec.action_size,))
+        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
+            jax.random.split(key_env, config.worlds), params
+        )
+        zero = jnp.zeros(config.worlds)
+        return PPOLearner(
+            learned=PPOLearned(
+                policy=init_learned({"mean": network, "log_std": log_std}),
+                critics=init_learned(jax.vmap(critic.init)(jax.random.split(key_critics, 2))),
+                multiplier=init_multiplier(hparams.initial_multiplier),
+                inputs=no_values((size,)),
+                returns=no_values((2,)),
+            ),
+            env_state=env_state,
+            observation=observation,
+            played=Played(zero, zero, zero),
+            key=key,
+            hparams=hparams,
+            batches=jnp.zeros((), jnp.int32),
+            diverged=jnp.zeros((), bool),
+        )
+
+    def centre_and_scale(inputs: Running) -> tuple[jax.Array, jax.Array]:
+        mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
+        if config.scaling == "world":
+            return mean, scale
+        seen = inputs.count > 0
+        spread = jnp.maximum(jnp.sqrt(inputs.variance), LEAST_SCALE * scale)
+        return jnp.where(seen, inputs.mean, mean), jnp.where(seen, spread, scale)
+
+    def scaled(inputs: Running, observation: jax.Array) -> jax.Array:
+        mean, scale = centre_and_scale(inputs)
+        return (observation - mean) / scale
+
+    def values(learned: PPOLearned, inputs: jax.Array) -> jax.Array:
+        """Both critics in the units of reward and cost, [..., O] -> [..., 2]."""
+        raw = jax.vmap(critic.apply, in_axes=(0, None), out_axes=-1)(learned.critics.params, inputs)
+        return raw[..., 0, :] * unit(learned.returns)
+
+    def unit(returns: Running) -> jax.Array:
+        return jnp.where(returns.count > 0, jnp.sqrt(returns.mean) + 1e-3, 1.0)
+
+    def step_worlds(key: jax.Array, learner: PPOLearner, action: jax.Array) -> Any:
+        """One step of every world with clipped actions; (learner, rollout row less observation)."""
+        observation, env_state, reward, terminated, truncated, info = jax.vmap(
+            env.step, in_axes=(0, 0, 0, None)
+        )(
+            jax.random.split(key, config.worlds),
+            learner.env_state,
+            jnp.clip(action, -1.0, 1.0),
+            params,
+        )
+        played = Played(
+            learner.played.reward + reward, learner.played.cost + info.cost, learner.played.length + 1
+        )
+        done = terminated | truncated
+        learner = dataclasses.replace(
+            learner,
+            env_state=env_state,
+            observation=observation,
+            played=jax.tree.map(lambda total: jnp.where(done, 0.0, total), played),
+        )
+        return learner, (reward, terminated, done, info, played)
+
+    def rollout(learner: PPOLearner) -> tuple[PPOLearner, Rollout]:
+        network, inputs = learner.learned.policy.params, learner.learned.inputs
+
+        def step(learner: PPOLearner, _: None) -> tuple[PPOLearner, Rollout]:
+            key, key_act, key_step = jax.random.split(learner.key, 3)
+            observation = learner.observation
+            mean = policy.apply(network["mean"], scaled(inputs, observation))
+            noise = jax.random.normal(key_act, mean.shape)
+            action = mean + jnp.exp(network["log_std"]) * noise
+            learner, row = step_worlds(key_step, dataclasses.replace(learner, key=key), action)
+            reward, terminated, done, info, played = row
+            return learner, Rollout(
+                observation,
+                action,
+                info.final_observation,
+                reward + learner.hparams.success_bonus * info.success,
+                info.cost,
+                terminated,
+                done,
+                info.success,
+                played,
+            )
+
+        return jax.lax.scan(step, learner, None, length=config.rollout_steps)
+
+    def improve(
+        learned: PPOLearned, steps: Rollout, key: jax.Array, hparams: PPOHParams, batch: jax.Array
+    ) -> tuple[PPOLearned, Metrics]:
+        """The epochs over one batch."""
+        inputs = scaled(learned.inputs, steps.observation)
+        before = values(learned, inputs)
+        after = values(learned, scaled(learned.inputs, steps.final_observation))
+        signal = jnp.stack([steps.reward, steps.cost], -1)
+        ends = steps.terminated[..., None], steps.done[..., None]
+        gain = advantages(signal, before, after, *ends, hparams.discount, hparams.smoothing)
+        flat = config.batch_steps
+        returns = learned.returns.add(jnp.reshape((gain + before) ** 2, (flat, 2)))
+        target = jnp.reshape(gain + before, (flat, 2)) / unit(returns)
+        gain = jnp.reshape(gain, (flat, 2))
+        gain, spread = gain - jnp.mean(gain, 0), jnp.std(gain, 0)
+        gain_reward, gain_cost = gain[:, 0] / (spread[0] + 1e-8), gain[:, 1]
+        inputs = jnp.reshape(inputs, (flat, size))
+        action = jnp.reshape(steps.action, (flat, -1))
+        old_mean = policy.apply(learned.policy.params["mean"], inputs)
+        old_log_std = learned.policy.params["log_std"]
+        old = gaussian_log_prob(old_mean, old_log_std, action)
+        multiplier = learned.multiplier.value
+        progress = batch / config.batches
+        rate = hparams.learning_rate * jnp.clip(1.0 - progress, 0.0, 1.0)
+        critics_only = batch < config.critic_batches
+
+        def policy_loss(network: Any, at: jax.Array) -> tuple[jax.Array, jax.Array]:
+            mean = policy.apply(network["mean"], inputs[at])
+            new = gaussian_log_prob(mean, network["log_std"], action[at])
+            loss = clipped_loss(new, old[at], gain_reward[at], hparams.clip)
+            # max(rho A, clip(rho) A) = -min(rho (-A), clip(rho) (-A))
+            loss = loss + multiplier * clipped_loss(new, old[at], -gain_cost[at], hparams.clip)
+            entropy = jnp.sum(network["log_std"])
+            away = gaussian_divergence(old_mean[at], old_log_std, mean, network["log_std"])
+            return loss / (1 + multiplier) - hparams.entropy_weight * entropy, jnp.mean(away)
+
+        def critic_loss(networks: Any, at: jax.Array) -> jax.Array:
+            raw = jax.vmap(critic.apply, in_axes=(0, None), out_axes=-1)(networks, inputs[at])
+            return jnp.mean(jnp.sum((raw[..., 0, :] - target[at]) ** 2, -1))
+
+        def minibatch(carry: Any, at: jax.Array) -> Any:
+            actor, critics, stop = carry
+
+            def move(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
+                grads, away = jax.grad(policy_loss, has_aux=True)(actor.params, at)
+                actor = adam_step(actor, limited(grads, hparams.max_gradient), rate)
+                floor = jnp.maximum(actor.params["log_std"], jnp.log(hparams.least_std))
+                moved = actor.params | {"log_std": floor}
+                return dataclasses.replace(actor, params=moved), (away, jnp.ones(()))
+
+            def stay(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
+                return actor, (jnp.zeros(()), jnp.zeros(()))
+
+            actor, made = jax.lax.cond(stop, stay, move, actor)
+            loss, grads = jax.value_and_grad(critic_loss)(critics.params, at)
+            # the critics keep their rate at the start of a run whose policy is cloned already
+            critics = adam_step(critics, limited(grads, hparams.max_gradient), rate)
+            return (actor, critics, stop), (*made, loss)
+
+        def epoch(carry: Any, key: jax.Array) -> Any:
+            at = jnp.reshape(jax.random.permutation(key, flat), (config.minibatches, rows))
+            (actor, critics, stop), (away, made, loss) = jax.lax.scan(minibatch, carry, at)
+            away = jnp.sum(away) / jnp.maximum(jnp.sum(made), 1)
+            stop = stop | (away > hparams.max_divergence)
+            return (actor, critics, stop), (away, jnp.mean(made), jnp.mean(loss))
+
+        keys = jax.random.split(key, config.epochs)
+        carry = (learned.policy, learned.critics, critics_only)
+        (actor, critics, _), (away, made, loss) = jax.lax.scan(epoch, carry, keys)
+        learned = dataclasses.replace(
+            learned,
+            policy=actor,
+            critics=critics,
+            inputs=learned.inputs.add(jnp.reshape(steps.observation, (flat, size))),
+            returns=returns,
+        )
+        return learned, {
+            "loss_critics": jnp.mean(loss),
+            "divergence": jnp.max(away),
+            "epochs": jnp.sum(made),
+            "advantage_std": spread[0],
+            "cost_advantage_std": spread[1],
+            "action_std": jnp.mean(jnp.exp(actor.params["log_std"])),
+        }
+
+    def iterate(learner: PPOLearner, _: None) -> tuple[PPOLearner, Metrics]:
+        learner, steps = rollout(learner)
+        key, key_improve = jax.random.split(learner.key)
+        hparams, before = learner.hparams, learner.learned
+        cost, known = mean_of_ended(steps.ended.cost, steps.done)
+        learned = dataclasses.replace(
+            before,
+            multiplier=update_multiplier(
+                before.multiplier, cost, hparams.cost_limit, hparams.multiplier_rate, known
+            ),
+        )
+        learned, metrics = improve(learned, steps, key_improve, hparams, learner.batches)
+        finite = jnp.all(jnp.isfinite(jnp.stack(list(metrics.values()))))
+        diverged = learner.diverged | ~finite
+        kept = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), learned, before)
+        metrics |= {
+            "episodes": jnp.sum(steps.done),
+            "episodic_return": mean_of_ended(steps.ended.reward, steps.done)[0],
+            "episodic_cost": cost,
+            "episode_length": mean_of_ended(steps.ended.length, steps.done)[0],
+            "success_rate": mean_of_ended(steps.success, steps.done)[0],
+            "multiplier": kept.multiplier.value,
+        }
+        learner = dataclasses.replace(
+            learner, learned=kept, key=key, batches=learner.batches + 1, diverged=diverged
+        )
+        return learner, {f"train/{name}": value for name, value in metrics.items()}
+
+    def run(learner: PPOLearner, batches: int) -> tuple[PPOLearner, Metrics]:
+        return jax.lax.scan(iterate, learner, None, length=batches)
+
+    def clone(learner: PPOLearner) -> tuple[PPOLearner, Metrics]:
+        """The expert demonstrates under noise, as in DART (Laskey et al. 2017); the mean clones it.
+
+        What is cloned is its action without the noise, which shows it how to get back.
+        """
+        assert expert is not None
+        length = -(-config.demonstrations // config.worlds)
+
+        def show(learner: PPOLearner, _: None) -> Any:
+            key, key_expert, key_noise, key_step = jax.random.split(learner.key, 4)
+            observation = learner.observation
+            action = jax.vmap(expert, in_axes=(0, 0, 0, None))(
+                jax.random.split(key_expert, config.worlds), learner.env_state, observation, params
+            )
+            noise = learner.hparams.demonstration_noise * jax.random.normal(key_noise, action.shape)
+            learner = dataclasses.replace(learner, key=key)
+            learner, row = step_worlds(key_step, learner, action + noise)
+            return learner, (observation, action, row[3].success, row[2])
+
+        learner, shown = jax.lax.scan(show, learner, None, length=length)
+        observation, action = (jnp.reshape(x, (-1, x.shape[-1])) for x in shown[:2])
+        inputs = learner.learned.inputs.add(observation)
+        inputs = dataclasses.replace(learner.learned, inputs=inputs).inputs
+        seen = scaled(inputs, observation)
+
+        def update(learned: Learned, at: Any) -> tuple[Learned, jax.Array]:
+            key, progress = at
+            chosen = jax.random.randint(key, (CLONING_BATCH,), 0, seen.shape[0])
+
+            def loss(network: Any) -> jax.Array:
+                mean = policy.apply(network["mean"], seen[chosen])
+                return -jnp.mean(log_likelihood(mean, action[chosen], "laplace"))
+
+            value, grads = jax.value_and_grad(loss)(learned.params)
+            return adam_step(learned, grads, CLONING_RATE * (1.0 - progress)), value
+
+        key, key_updates = jax.random.split(learner.key)
+        updates = config.cloning_updates
+        each = (jax.random.split(key_updates, updates), jnp.arange(updates) / max(updates, 1))
+        cloned, losses = jax.lax.scan(update, learner.learned.policy, each)
+        start = init_learned(cloned.average)  # PPO's Adam starts anew
+        learned = dataclasses.replace(learner.learned, policy=start, inputs=inputs)
+        zero = jnp.zeros(config.worlds)
+        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
+            jax.random.split(key, config.worlds), params
+        )
+        learner = dataclasses.replace(
+            learner,
+            learned=learned,
+            key=key,
+            env_state=env_state,
+            observation=observation,
+            played=Played(zero, zero, zero),
+        )
+        return learner, {
+            "clone/loss": losses[-1],
+            "clone/success_rate": mean_of_ended(shown[2], shown[3])[0],
+        }
+
+    def saved(learner: PPOLearner) -> SavedPolicy:
+        network = learner.learned.policy.average
+        mean, scale = centre_and_scale(learner.learned.inputs)
+        return SavedPolicy(
+            layers(network["mean"]), "relu", "tanh", mean, scale, log_std=network["log_std"]
+        )
+
+    return PPOFunctions(init, clone, run, saved)
+
+
+def limited(grads: PyTree, norm: jax.Array) -> PyTree:
+    """Gradients with their norm clipped."""
+    clipped, _ = optax.clip_by_global_norm(norm).update(grads, optax.EmptyState())  # pyright: ignore
+    return clipped
