@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import Positional, subcommand
+from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
 from envs.compiler import set_xla_flags
 from experiments.runtime import UserError
@@ -209,6 +209,104 @@ class Tune:
 
 
 @dataclasses.dataclass
+class ExpertTrain:
+    """Train a neural expert by PPO-Lagrangian: progress, then the evaluation table; a run folder.
+
+    Defaults are those of the world's shipped expert.
+    """
+
+    env: Positional[str]
+    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
+    seed: int = 0
+    """Random seed."""
+    total_steps: int | None = None
+    """Environment steps."""
+    worlds: int | None = None
+    """Worlds stepped side by side."""
+    rollout_steps: int | None = None
+    """Steps of each world per batch."""
+    epochs: int | None = None
+    """Passes over a batch."""
+    minibatches: int | None = None
+    """Updates per pass."""
+    hidden: tuple[int, ...] | None = None
+    """Widths of the hidden layers of policy and critics."""
+    scaling: Literal["running", "world"] | None = None
+    """Inputs are scaled by running statistics, or by the world's constants."""
+    demonstrations: int | None = None
+    """Steps of the scripted expert, under noise, that the policy clones first."""
+    cloning_updates: int | None = None
+    """Updates of that."""
+    demonstration_noise: float | None = None
+    """Standard deviation of that noise."""
+    critic_batches: int | None = None
+    """Batches at the start in which only the critics learn."""
+    learning_rate: float | None = None
+    """Of Adam; falls linearly to 0."""
+    discount: float | None = None
+    """gamma."""
+    smoothing: float | None = None
+    """lambda of the generalised advantages."""
+    clip: float | None = None
+    """PPO's bound on the ratio."""
+    max_divergence: float | None = None
+    """KL at which a batch's policy updates stop."""
+    max_gradient: float | None = None
+    """Norm to which gradients are clipped."""
+    entropy_weight: float | None = None
+    """Weight of the policy's entropy."""
+    cost_limit: float | None = None
+    """Mean cost per episode that is allowed."""
+    initial_multiplier: float | None = None
+    """Of the cost, at the start."""
+    multiplier_rate: float | None = None
+    """Adam's rate for the multiplier."""
+    initial_std: float | None = None
+    """Standard deviation of the actions at the start."""
+    least_std: float | None = None
+    """Standard deviation of the actions at least."""
+    success_bonus: float | None = None
+    """Reward for solving the task, while training."""
+    training_scenarios: int | None = None
+    """Generated scenarios to train on, numbered from 10,000; 0 for the novice's."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
+    evaluate_every: int | None = None
+    """Batches between evaluations and checkpoints (default: a fortieth of the run)."""
+    out: Path | None = None
+    """Run folder (default: runs/ENV-expert-SEED-TIME)."""
+    resume: bool = False
+    """Go on with the run in --out."""
+
+
+@dataclasses.dataclass
+class ExpertEvaluate:
+    """Play every held-out scenario once with an expert."""
+
+    env: Positional[str]
+    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
+    kind: str = "neural"
+    """neural (the shipped one), scripted, or a policy file or run folder."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to play instead of the held-out ones."""
+    out: Path | None = None
+    """Write one row per scenario to this CSV file."""
+
+
+@dataclasses.dataclass
+class Expert:
+    """Train or evaluate an expert."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[ExpertTrain, subcommand("train")]
+        | Annotated[ExpertEvaluate, subcommand("evaluate")]
+    ]
+    """What to do."""
+
+
+@dataclasses.dataclass
 class Export:
     """Write a run's policy as one file that plain NumPy can run."""
 
@@ -261,6 +359,7 @@ Command = (
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Ablation, subcommand("ablation")]
     | Annotated[Tune, subcommand("tune")]
+    | Annotated[Expert, subcommand("expert")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Bench, subcommand("bench")]
@@ -379,6 +478,62 @@ def _tune(command: Tune) -> None:
     tune(command)
 
 
+def _expert(command: Expert) -> None:
+    if isinstance(command.command, ExpertTrain):
+        _expert_train(command.command)
+    else:
+        _expert_evaluate(command.command)
+
+
+def _expert_train(command: ExpertTrain) -> None:
+    from experiments.expert import EVALUATIONS, ExpertSettings, check, settings_for, train_expert
+    from experiments.runtime import start_jax
+    from experiments.tables import print_run
+
+    config, hparams, training = settings_for(command.env)
+    given = {name: value for name, value in vars(command).items() if value is not None}
+    static = {f.name: given[f.name] for f in dataclasses.fields(config) if f.name in given}
+    traced = {f.name: given[f.name] for f in dataclasses.fields(hparams) if f.name in given}
+    config = dataclasses.replace(config, **static)
+    settings = ExpertSettings(
+        env=command.env,
+        seed=command.seed,
+        config=config,
+        hparams=dataclasses.replace(hparams, **traced),
+        scenarios=command.scenarios,
+        held_out_scenarios=command.held_out_scenarios,
+        training_scenarios=given.get(
+            "training_scenarios", training if command.scenarios is None else 0
+        ),
+        evaluate_every=given.get("evaluate_every", 1),
+    )
+    check(settings)
+    if command.evaluate_every is None:
+        every = max(config.batches // EVALUATIONS, 1)
+        settings = dataclasses.replace(settings, evaluate_every=every)
+    if command.resume and command.out is None:
+        raise UserError("--resume needs --out, the run folder to go on with")
+    name = f"{command.env.replace(':', '-')}-expert-{command.seed}"
+    out = command.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    start_jax()
+    train_expert(settings, out, command.resume)
+    print_run(out)
+
+
+def _expert_evaluate(command: ExpertEvaluate) -> None:
+    from experiments.evaluate import make_world
+    from experiments.expert import evaluate_expert
+    from experiments.runtime import start_jax
+    from experiments.tables import print_evaluation, write_rows
+
+    start_jax()
+    options = {} if command.scenarios is None else {"held_out_scenarios": command.scenarios}
+    rows = evaluate_expert(make_world(command.env, options), command.kind)
+    if command.out is not None:
+        write_rows(command.out, [row._asdict() for row in rows])
+    print_evaluation(f"{command.kind} expert", rows)
+
+
 def _export(command: Export) -> None:
     import shutil
 
@@ -419,6 +574,7 @@ _ACTIONS = {
     Compare: _compare,
     Ablation: _ablation,
     Tune: _tune,
+    Expert: _expert,
     Export: _export,
     Render: _render,
     Bench: _bench,

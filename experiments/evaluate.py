@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make
+from envs import make, pretrained
 from experiments.policy_file import load_policy
 from experiments.runtime import UserError
 from ppl_jax import experts
 from ppl_jax.evaluation import Episodes, make_evaluate
-from ppl_jax.experts import SavedPolicy
+from ppl_jax.experts import SavedPolicy, neural_expert
 from ppl_jax.runlog import EVALUATION, POLICY, RunFolder
-from ppl_jax.types import Env, WorldSpec
+from ppl_jax.types import Env, Expert, WorldSpec
 
 
 class EvaluationRow(NamedTuple):
@@ -151,6 +151,34 @@ def make_world(name: str, options: dict[str, Any]) -> Env:
     """Build a world; a mistake becomes a `UserError`."""
     try:
         return make(name, **options)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def named_expert(name: str, env: Env) -> Expert:
+    """The expert "scripted", the shipped one, "neural", or that of a policy file or run folder.
+
+    Raises:
+        UserError: If there is none, or the file cannot be used.
+    """
+    if name == "scripted":
+        expert = getattr(env, "scripted_expert", None)
+        if expert is None:
+            raise UserError(f"expert: {env.name} has no scripted expert, give a policy file")
+        return expert
+    return neural_expert(named_policy(name, env))
+
+
+def named_policy(name: str, env: Env) -> SavedPolicy:
+    """The shipped expert's policy, "neural", or that of a policy file or run folder.
+
+    Raises:
+        UserError: If there is none, or the file cannot be used.
+    """
+    if name != "neural":
+        return read_policy(policy_path(Path(name)), env.spec)
+    try:
+        return read_policy(pretrained.policy_path(env.name), env.spec)
     except ValueError as error:
         raise UserError(str(error)) from error
 

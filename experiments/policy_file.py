@@ -2,13 +2,15 @@
 
 Arrays `w0, b0, w1, b1, ...` (row vectors: `x @ w + b`), `activation` ("relu" or "tanh", between
 layers), `output` ("tanh": squash the last layer; "clip": clip it to [-1, 1]), optionally `obs_mean`
-and `obs_scale` (`(obs - mean) / scale` first), and `meta`, a JSON string.
+and `obs_scale` (`(obs - mean) / scale` first), `log_std` (of the Gaussian around the action, where the
+policy has one), `version` of this format, and `meta`, a JSON string.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,16 @@ import numpy as np
 
 from ppl_jax.experts import SavedPolicy
 
+VERSION = 1
+
 
 def save_policy(path: str | Path, policy: SavedPolicy, meta: dict[str, Any]) -> None:
     """Write a policy file, whole or not at all."""
     arrays: dict[str, Any] = {}
     for i, (w, b) in enumerate(policy.weights):
         arrays[f"w{i}"], arrays[f"b{i}"] = np.asarray(w), np.asarray(b)
+    if policy.log_std is not None:
+        arrays["log_std"] = np.asarray(policy.log_std, np.float32)
     part = Path(f"{path}.part")
     with open(part, "wb") as file:
         np.savez(
@@ -31,6 +37,7 @@ def save_policy(path: str | Path, policy: SavedPolicy, meta: dict[str, Any]) -> 
             output=np.array(policy.output),
             obs_mean=np.asarray(policy.obs_mean, np.float32),
             obs_scale=np.asarray(policy.obs_scale, np.float32),
+            version=np.array(VERSION),
             meta=np.array(json.dumps(meta)),
         )
     os.replace(part, path)
@@ -40,38 +47,51 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     """Read a policy file and check it against a world.
 
     Raises:
-        ValueError: If the file is missing or no policy, a number in it is not finite, or its
-            sizes are not the world's.
+        ValueError: If the file is missing, no policy or of a newer version, a number in it is not
+            finite, its layers do not fit together, or its sizes are not the world's.
     """
+    name = f"policy file {str(path)!r}"
     try:
         with np.load(path, allow_pickle=False) as archive:
             files = {name: archive[name] for name in archive.files}
         count = sum(name[0] == "w" and name[1:].isdigit() for name in files)
         weights = [(files[f"w{i}"], files[f"b{i}"]) for i in range(count)]
         activation, output = str(files["activation"]), str(files["output"])
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"policy file {str(path)!r} cannot be read: {error}") from error
+        version = int(files.get("version", VERSION))
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{name} cannot be read: {error}") from error
+    if version > VERSION:
+        raise ValueError(f"{name} has version {version}; this program reads up to {VERSION}")
     if not weights:
-        raise ValueError(f"policy file {str(path)!r} holds no layer w0, b0")
+        raise ValueError(f"{name} holds no layer w0, b0")
     if activation not in ("relu", "tanh") or output not in ("tanh", "clip"):
         raise ValueError(
-            f"policy file {str(path)!r}: activation must be relu or tanh and output tanh or clip, "
-            f"got {activation!r} and {output!r}"
+            f"{name}: activation must be relu or tanh and output tanh or clip, got "
+            f"{activation!r} and {output!r}"
         )
     mean = files.get("obs_mean", np.zeros(observation_size, np.float32))
     scale = files.get("obs_scale", np.ones(observation_size, np.float32))
-    for name, value in [
-        *((f"w{i}", w) for i, (w, _) in enumerate(weights)),
-        *((f"b{i}", b) for i, (_, b) in enumerate(weights)),
-        ("obs_mean", mean),
-        ("obs_scale", scale),
-    ]:
-        if not np.isfinite(value).all():
-            raise ValueError(f"policy file {str(path)!r}: {name} holds a NaN or infinite number")
+    log_std = files.get("log_std")
+    for i, (w, b) in enumerate(weights):
+        fits = w.ndim == 2 and b.shape == w.shape[1:]
+        if not fits or (i and weights[i - 1][0].shape[1] != w.shape[0]):
+            raise ValueError(f"{name}: w{i} {w.shape} and b{i} {b.shape} do not fit the layer before")
     takes, gives = weights[0][0].shape[0], weights[-1][0].shape[1]
     if takes != observation_size or gives != action_size:
         raise ValueError(
-            f"policy file {str(path)!r} maps {takes} observations to {gives} actions; this world "
-            f"has {observation_size} and {action_size}"
+            f"{name} maps {takes} observations to {gives} actions; this world has "
+            f"{observation_size} and {action_size}"
         )
-    return SavedPolicy(weights, activation, output, mean, scale)
+    arrays = {f"{kind}{i}": x for i, layer in enumerate(weights) for kind, x in zip("wb", layer, strict=True)}
+    arrays |= {"obs_mean": mean, "obs_scale": scale}
+    if log_std is not None:
+        arrays["log_std"] = log_std
+    shapes = {"obs_mean": (takes,), "obs_scale": (takes,), "log_std": (gives,)}
+    for field, value in arrays.items():
+        if value.shape != shapes.get(field, value.shape):
+            raise ValueError(f"{name}: {field} has shape {value.shape}, expected {shapes[field]}")
+        if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value).all():
+            raise ValueError(f"{name}: {field} holds something that is not a finite number")
+    if not (scale > 0).all():
+        raise ValueError(f"{name}: obs_scale must be positive")
+    return SavedPolicy(weights, activation, output, mean, scale, log_std)

@@ -40,17 +40,17 @@ def print_run(run: Path) -> None:
     folder = RunFolder(run)
     config, summary = folder.config(), folder.read_json(SUMMARY)
     rows = read_evaluation(run)
-    human = {}
+    human = {}  # an expert has none
     with open(run / "evaluation.csv", newline="") as file:
         for row in csv.DictReader(file):
-            human[int(row["step"])] = int(row["human_data_usage"])
+            human[int(row["step"])] = row.get("human_data_usage", "-")
     lines = []
     for step in sorted({row.step for row in rows}):
         scores = summarise_episodes([row for row in rows if row.step == step])
         lines.append(
             [
                 str(step),
-                str(human[step]),
+                human[step],
                 f"{scores['success_rate']:.2f}",
                 f"{scores['route_completion']:.2f}",
                 f"{scores['episodic_return']:.0f}",

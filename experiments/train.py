@@ -19,6 +19,7 @@ from experiments.evaluate import (
     arrays_of,
     evaluate_policy,
     make_world,
+    named_expert,
     read_evaluation,
     read_policy,
     summarise_episodes,
@@ -28,7 +29,7 @@ from experiments.progress import Progress
 from experiments.runtime import UserError, device, revision, versions
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import HParams, TrainConfig, validate
-from ppl_jax.experts import SavedPolicy, neural_expert
+from ppl_jax.experts import SavedPolicy
 from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.networks import Layers
 from ppl_jax.runlog import POLICY, SUMMARY, RunFolder
@@ -45,7 +46,7 @@ class RunSettings:
     Attributes:
         env, algorithm, seed: What is trained.
         config, hparams: Static and traced settings.
-        expert: "scripted", or a policy file.
+        expert: "scripted", "neural" (the shipped one), or a policy file.
         reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
         evaluate_on: "held_out" or (to choose settings by) "training".
@@ -148,9 +149,7 @@ def build(settings: RunSettings) -> tuple[Env, Expert]:
         if (value := getattr(settings, name)) is not None
     }
     env = make_world(settings.env, options)
-    if settings.expert == "scripted":
-        return env, env.scripted_expert
-    return env, neural_expert(read_policy(settings.expert, env.spec))
+    return env, named_expert(settings.expert, env)
 
 
 def maker(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
@@ -199,12 +198,12 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             f"evaluate_every must be a multiple of rollout_steps ({every}) for "
             f"{settings.algorithm}, got {settings.evaluate_every}"
         )
-    _open(folder, settings, resume)
+    open_folder(folder, settings.as_json(), resume)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     plan = _plan(settings.config, settings.evaluate_every)
     done = 0
     if resume:
-        done, learner = _restore(folder, learner)
+        done, learner = restore_learner(folder, learner)
         evaluated = [chunk.step for chunk in plan if chunk.evaluate and chunk.end <= done]
         folder.rewind(done, max(evaluated, default=-1))
         if done >= plan[-1].end:
@@ -266,8 +265,17 @@ def _part(length: int, interval: int) -> int:
     return length // parts
 
 
-def _open(folder: RunFolder, settings: RunSettings, resume: bool) -> None:
-    content = settings.as_json()
+def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> None:
+    """Make a run folder, or check that the one to go on with was made with the same settings.
+
+    Args:
+        folder: Of the run.
+        content: Of config.json; versions, device and revision are added.
+        resume: Go on with the folder.
+
+    Raises:
+        UserError: If it cannot be made, or differs.
+    """
     if resume:
         try:
             before = folder.config()
@@ -293,7 +301,9 @@ def _open(folder: RunFolder, settings: RunSettings, resume: bool) -> None:
         raise UserError(str(error)) from error
 
 
-def _restore(folder: RunFolder, learner: Learner) -> tuple[int, Learner]:
+def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
+    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none."""
+
     def warn(line: str) -> None:
         print(f"warning: {line}", file=sys.stderr)
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.distributions import gaussian_log_prob
 from ppl_jax.types import Expert
 
 
@@ -39,6 +40,21 @@ def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
     w, b = policy.weights[-1]
     x = x @ w + b
     return jnp.tanh(x) if policy.output == "tanh" else jnp.clip(x, -1.0, 1.0)
+
+
+def log_density(policy: SavedPolicy, observation: jax.Array, action: jax.Array) -> jax.Array:
+    """Log of the density that a policy's Gaussian gives to an action, [..., O], [..., A] -> [...].
+
+    Its mean is the deterministic action. It is the density before clipping to the action box, and
+    so may exceed 1. A gate by action probability (EGPO; Peng et al. 2021) has the expert take over
+    where it falls below a threshold.
+
+    Raises:
+        ValueError: If the policy has no standard deviation.
+    """
+    if policy.log_std is None:
+        raise ValueError("this policy is deterministic: it has no log_std, so no density")
+    return gaussian_log_prob(act(policy, observation), jnp.asarray(policy.log_std), action)
 
 
 def neural_expert(policy: SavedPolicy) -> Expert:
