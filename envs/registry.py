@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+BRAX = "brax:"
+
 _MAKERS: dict[str, Callable[..., Any]] = {}
 
 
@@ -20,15 +22,29 @@ def registered() -> tuple[str, ...]:
     return tuple(sorted(_MAKERS))
 
 
+def known(name: str) -> bool:
+    """Whether `make` may know it: a registered world, or one of brax."""
+    return name in _MAKERS or name.startswith(BRAX)
+
+
 def make(name: str, **options: Any) -> Any:
-    """Build the world `name`.
+    """Build the world `name`; "brax:NAME" is a brax environment.
 
     Raises:
         ValueError: If no world has that name.
     """
+    if name.startswith(BRAX):
+        from envs.adapters.brax import make_brax
+
+        return make_brax(name.removeprefix(BRAX), **options)
     if name not in _MAKERS:
-        raise ValueError(f"unknown environment {name!r}: choose one of {', '.join(registered())}")
+        raise ValueError(unknown(name))
     return _MAKERS[name](**options)
+
+
+def unknown(name: str) -> str:
+    """What to say of a name that no world has."""
+    return f"unknown environment {name!r}: choose one of {', '.join(registered())} or {BRAX}NAME"
 
 
 def _driving(**options: Any) -> Any:

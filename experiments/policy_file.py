@@ -75,14 +75,20 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     for i, (w, b) in enumerate(weights):
         fits = w.ndim == 2 and b.shape == w.shape[1:]
         if not fits or (i and weights[i - 1][0].shape[1] != w.shape[0]):
-            raise ValueError(f"{name}: w{i} {w.shape} and b{i} {b.shape} do not fit the layer before")
+            raise ValueError(
+                f"{name}: w{i} {w.shape} and b{i} {b.shape} do not fit the layer before"
+            )
     takes, gives = weights[0][0].shape[0], weights[-1][0].shape[1]
     if takes != observation_size or gives != action_size:
         raise ValueError(
             f"{name} maps {takes} observations to {gives} actions; this world has "
             f"{observation_size} and {action_size}"
         )
-    arrays = {f"{kind}{i}": x for i, layer in enumerate(weights) for kind, x in zip("wb", layer, strict=True)}
+    arrays = {
+        f"{kind}{i}": x
+        for i, layer in enumerate(weights)
+        for kind, x in zip("wb", layer, strict=True)
+    }
     arrays |= {"obs_mean": mean, "obs_scale": scale}
     if log_std is not None:
         arrays["log_std"] = log_std

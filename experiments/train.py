@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs import registered
+from envs import known, unknown
 from experiments.evaluate import (
     arrays_of,
     evaluate_policy,
@@ -107,10 +107,8 @@ def check(settings: RunSettings) -> None:
     Raises:
         UserError: One line naming field, value and what is allowed.
     """
-    if settings.env not in registered():
-        raise UserError(
-            f"unknown environment {settings.env!r}: choose one of {', '.join(registered())}"
-        )
+    if not known(settings.env):
+        raise UserError(unknown(settings.env))
     if settings.seed < 0:
         raise UserError(f"seed must not be negative, got {settings.seed}")
     interval = settings.config.decision_interval

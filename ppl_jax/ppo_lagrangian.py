@@ -278,12 +278,14 @@ class PPOFunctions(NamedTuple):
         run: `run(learner, batches) -> (learner, Metrics)` for a static number of batches; metrics
             carry a leading [batches] axis.
         policy: `policy(learner) -> SavedPolicy` with its `log_std`.
+        critics: `critics(learner, observation [..., O]) -> [..., 2]`: values of reward and cost.
     """
 
     init: Callable[[jax.Array, PPOHParams], PPOLearner]
     clone: Callable[[PPOLearner], tuple[PPOLearner, Metrics]]
     run: Callable[[PPOLearner, int], tuple[PPOLearner, Metrics]]
     policy: Callable[[PPOLearner], SavedPolicy]
+    critics: Callable[[PPOLearner, jax.Array], jax.Array]
 
 
 def validate(config: PPOConfig, hparams: PPOHParams) -> None:
@@ -400,7 +402,9 @@ def make_ppo_lagrangian(
             params,
         )
         played = Played(
-            learner.played.reward + reward, learner.played.cost + info.cost, learner.played.length + 1
+            learner.played.reward + reward,
+            learner.played.cost + info.cost,
+            learner.played.length + 1,
         )
         done = terminated | truncated
         learner = dataclasses.replace(
@@ -618,7 +622,10 @@ def make_ppo_lagrangian(
             layers(network["mean"]), "relu", "tanh", mean, scale, log_std=network["log_std"]
         )
 
-    return PPOFunctions(init, clone, run, saved)
+    def critics(learner: PPOLearner, observation: jax.Array) -> jax.Array:
+        return values(learner.learned, scaled(learner.learned.inputs, observation))
+
+    return PPOFunctions(init, clone, run, saved, critics)
 
 
 def limited(grads: PyTree, norm: jax.Array) -> PyTree:

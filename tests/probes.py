@@ -151,3 +151,74 @@ class Balance(Goal):
     @staticmethod
     def scripted_expert(key, state, observation, params):
         return jnp.clip(jnp.atleast_1d(-1.3 / 0.4 * state.place), -1.0, 1.0)
+
+
+class Spend(Goal):
+    """One step: the reward is 2 a, the cost (1 + a)^2 / 2.
+
+    With E[cost] <= 1/2 and a ~ N(m, s): (1 + m)^2 + s^2 = 1, and the multiplier is 2 / (1 + m).
+    """
+
+    name = "spend"
+    max_episode_steps = 1
+
+    def __init__(self):
+        self.default_params = self.held_out_params = ProbeParams(jnp.zeros(2))
+
+    def transition(self, key, state, action, params):
+        a, yes = action[0], jnp.ones((), bool)
+        return state.replace(time=state.time + 1), Outcome(
+            reward=2.0 * a,
+            terminated=yes,
+            truncated=~yes,
+            cost=(1.0 + a) ** 2 / 2,
+            success=yes,
+            unsafe=~yes,
+            progress=jnp.ones(()),
+            speed=jnp.ones(()),
+        )
+
+
+class TwoSteps(Goal):
+    """Two steps whatever one does; the second pays 1 and costs 3: V(s0) = gamma, V(s1) = 1."""
+
+    name = "two_steps"
+    max_episode_steps = 2
+
+    def __init__(self):
+        self.default_params = self.held_out_params = ProbeParams(jnp.zeros(2))
+
+    def observe(self, state, params):
+        return jnp.stack([1.0 * state.time, jnp.ones(())])
+
+    def transition(self, key, state, action, params):
+        time = state.time + 1
+        last = time >= 2
+        return GoalState(state.place, time), Outcome(
+            reward=1.0 * last,
+            terminated=last,
+            truncated=jnp.zeros((), bool),
+            cost=3.0 * last,
+            success=last,
+            unsafe=last,
+            progress=time / 2,
+            speed=jnp.ones(()),
+        )
+
+
+class Endless(TwoSteps):
+    """Every step pays 1, time alone ends it and the observation never changes: V = 1 / (1 - gamma)."""
+
+    name = "endless"
+    max_episode_steps = 3
+
+    def observe(self, state, params):
+        return jnp.ones(2)
+
+    def transition(self, key, state, action, params):
+        state, outcome = super().transition(key, state, action, params)
+        no = jnp.zeros((), bool)
+        outcome = outcome.replace(
+            reward=jnp.ones(()), terminated=no, truncated=state.time >= self.max_episode_steps
+        )
+        return state, outcome
