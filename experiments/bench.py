@@ -23,6 +23,7 @@ from experiments.tables import print_table
 from ppl_jax import algorithms
 from ppl_jax.algorithms.ppl import make_ppl
 from ppl_jax.config import as_arrays
+from ppl_jax.ppo_lagrangian import make_ppo_lagrangian
 from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
 
@@ -45,7 +46,8 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
 
     Args:
         repeats: Of each figure; medians are reported.
-        parts: Of "worlds", "training", "methods", "seeds" (methods, and five seeds in one program).
+        parts: Of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds in
+            one program).
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
@@ -58,6 +60,8 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     if "training" in parts:
         figures |= _training(env, repeats)
         figures |= _gradient(env, repeats, figures["train_ms_per_step"])
+    for name in ("driving", "table_wiping", "nut_assembly") if "experts" in parts else ():
+        figures |= _expert(name, repeats)
     for name in algorithms.registered(variants=False):
         if "methods" in parts or "seeds" in parts:
             figures |= _method(env, name, repeats, "seeds" in parts)
@@ -244,6 +248,39 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
         figures[f"{name}_five_seeds_over_five_runs"] = batch / (seeds * alone)
         figures[f"{name}_five_seeds_over_five_runs_with_compile"] = whole / (seeds * run)
     return figures
+
+
+def _expert(name: str, repeats: int) -> dict[str, float]:
+    """Environment steps per second of PPO-Lagrangian, updates included, and the updates' share.
+
+    The share is what a batch with all its epochs takes longer than one with a single epoch, per
+    epoch and times their number.
+    """
+    from experiments.expert import settings_for
+
+    env = make(name)
+    config, hparams, _ = settings_for(name)
+    seconds, compile_s = {}, 0.0
+    for epochs in (1, config.epochs):
+        functions = make_ppo_lagrangian(env, dataclasses.replace(config, epochs=epochs))
+        learner = jax.jit(functions.init)(jax.random.key(0), hparams)
+        began = time.perf_counter()
+        program = jax.jit(lambda learner, run=functions.run: run(learner, 1)[0], donate_argnums=0)
+        compiled = program.lower(learner).compile()
+        compile_s, times = time.perf_counter() - began, []
+        for _ in range(repeats + 1):
+            began = time.perf_counter()
+            learner = jax.block_until_ready(compiled(learner))
+            times.append(time.perf_counter() - began)
+        seconds[epochs] = float(np.median(times[1:]))
+    whole = seconds[config.epochs]
+    updates = (whole - seconds[1]) / (config.epochs - 1) * config.epochs
+    return {
+        f"expert_{name}_steps_per_s": config.batch_steps / whole,
+        f"expert_{name}_hours_for_20m_steps": 20e6 / config.batch_steps * whole / 3600,
+        f"expert_{name}_share_updates": updates / whole,
+        f"expert_{name}_compile_s": compile_s,
+    }
 
 
 def _training(env: Any, repeats: int) -> dict[str, float]:

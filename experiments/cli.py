@@ -99,7 +99,7 @@ class Train:
     predictor: Literal["simulator", "kinematic"] | None = None
     """The world's own transition, or the rule-based bicycle with traffic frozen."""
     expert: str = "scripted"
-    """The scripted expert, or a policy file (.npz)."""
+    """scripted, neural (the shipped one), or a policy file or run folder."""
     scenarios: str | None = None
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
@@ -154,6 +154,8 @@ class Compare:
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
     """Folder of recorded scenarios to evaluate on."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
     processes: int = 2
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("compare")
@@ -178,6 +180,8 @@ class Ablation:
     """Samples per loss and update."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
     processes: int = 2
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("ablation")
@@ -202,6 +206,8 @@ class Tune:
     """Environment steps of gail."""
     batch_size: int | None = None
     """Samples per loss and update."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
     processes: int = 2
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("tune")
@@ -321,7 +327,7 @@ class Render:
     """Draw one episode of a policy as GIF, MP4 or PNG (the file's ending decides)."""
 
     run: Positional[str]
-    """Run folder, policy file, or "scripted"."""
+    """Run folder, policy file, "scripted" or "neural"."""
     scenario: int = 1000
     """Number of a held-out scenario."""
     out: Path = Path("episode.gif")
@@ -329,7 +335,7 @@ class Render:
     steps: int = 600
     """At most so many steps."""
     env: str = "driving"
-    """World of "scripted": driving, table_wiping or nut_assembly."""
+    """World of "scripted" and "neural": driving, table_wiping or nut_assembly."""
 
 
 @dataclasses.dataclass
@@ -338,9 +344,10 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
-    parts: tuple[Literal["worlds", "training", "methods", "seeds"], ...] = (
+    parts: tuple[Literal["worlds", "training", "experts", "methods", "seeds"], ...] = (
         "worlds",
         "training",
+        "experts",
         "methods",
     )
     """What to measure; seeds (methods, and five seeds of each in one program) takes long."""

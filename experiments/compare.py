@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     Settings = Ablation | Compare | Tune
 
 OPTIONS = ("preset", "gate", "min_return", "max_departure", "batch_size")
-OPTIONS += ("scenarios", "held_out_scenarios")
+OPTIONS += ("expert", "scenarios", "held_out_scenarios")
 
 
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")

@@ -176,7 +176,8 @@ def named_policy(name: str, env: Env) -> SavedPolicy:
         UserError: If there is none, or the file cannot be used.
     """
     if name != "neural":
-        return read_policy(policy_path(Path(name)), env.spec)
+        path = Path(name)
+        return read_policy(policy_path(path) if path.is_dir() else path, env.spec)
     try:
         return read_policy(pretrained.policy_path(env.name), env.spec)
     except ValueError as error:

@@ -28,14 +28,8 @@ from experiments.train import open_folder, restore_learner
 from ppl_jax import checkpoint
 from ppl_jax.evaluation import evaluate
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.ppo_lagrangian import (
-    PPOConfig,
-    PPOFunctions,
-    PPOHParams,
-    PPOLearner,
-    make_ppo_lagrangian,
-    validate,
-)
+from ppl_jax.ppo_config import PPOConfig, PPOHParams, validate
+from ppl_jax.ppo_lagrangian import PPOFunctions, PPOLearner, make_ppo_lagrangian
 from ppl_jax.runlog import POLICY, SUMMARY, RunFolder
 from ppl_jax.types import Env
 
@@ -74,11 +68,8 @@ class ExpertSettings:
 
 def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
     """What trained the shipped expert of a world, and on how many scenarios; or the defaults."""
-    if env == "driving":
-        # many maps: on the novice's fifty an expert learns them by heart
-        return PPOConfig(), PPOHParams(cost_limit=0.5), 1000
-    # an arm starts as a clone of the scripted expert, with little noise, and is improved gently
-    config = PPOConfig(scaling="world", demonstrations=100_000, critic_batches=10)
+    # each starts as a clone of the scripted expert, with little noise, and is improved gently
+    config = PPOConfig(demonstrations=100_000, critic_batches=10)
     hparams = PPOHParams(
         learning_rate=1e-4,
         max_divergence=0.01,
@@ -86,6 +77,11 @@ def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
         initial_std=0.2,
         demonstration_noise=0.2,
     )
+    if env == "driving":
+        # many maps: the novice's fifty would be learnt by heart
+        config = dataclasses.replace(config, demonstrations=500_000)
+        return config, hparams.replace(cost_limit=0.5, final_std=0.05), 1000
+    config = dataclasses.replace(config, scaling="world")
     # where hovering over the last marker or the peg pays for ever, solving the task must pay more
     if env == "table_wiping":
         config = dataclasses.replace(config, total_steps=10_000_000)
@@ -144,10 +140,10 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     began = time.perf_counter()
     config, folder = settings.config, RunFolder(out)
     env = build(settings)
-    expert = getattr(env, "scripted_expert", None)
-    if config.demonstrations and expert is None:
-        raise UserError(f"demonstrations: {env.name} has no scripted expert to give them")
-    functions = make_ppo_lagrangian(env, config, expert=expert)
+    try:
+        functions = make_ppo_lagrangian(env, config, expert=getattr(env, "scripted_expert", None))
+    except ValueError as error:
+        raise UserError(str(error)) from error
     open_folder(folder, settings.as_json(), resume)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     done = 0

@@ -2,8 +2,8 @@
 
 Arrays `w0, b0, w1, b1, ...` (row vectors: `x @ w + b`), `activation` ("relu" or "tanh", between
 layers), `output` ("tanh": squash the last layer; "clip": clip it to [-1, 1]), optionally `obs_mean`
-and `obs_scale` (`(obs - mean) / scale` first), `log_std` (of the Gaussian around the action, where the
-policy has one), `version` of this format, and `meta`, a JSON string.
+and `obs_scale` (`(obs - mean) / scale` first) and `log_std` (of the Gaussian around the action, of
+a policy that has one), `version` of this format, and `meta`, a JSON string.
 """
 
 from __future__ import annotations
@@ -96,8 +96,10 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     for field, value in arrays.items():
         if value.shape != shapes.get(field, value.shape):
             raise ValueError(f"{name}: {field} has shape {value.shape}, expected {shapes[field]}")
-        if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value).all():
-            raise ValueError(f"{name}: {field} holds something that is not a finite number")
+        if value.dtype.kind != "f":
+            raise ValueError(f"{name}: {field} holds {value.dtype}, expected real numbers")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name}: {field} holds a NaN or infinite number")
     if not (scale > 0).all():
         raise ValueError(f"{name}: obs_scale must be positive")
     return SavedPolicy(weights, activation, output, mean, scale, log_std)

@@ -12,10 +12,9 @@ import numpy as np
 
 from envs.driving.scenario import take
 from envs.rendering import Paths, Scene, draw, save_frames
-from experiments.evaluate import make_world, policy_path, read_policy, run_options
+from experiments.evaluate import make_world, named_expert, run_options
 from experiments.runtime import UserError
 from ppl_jax.config import default
-from ppl_jax.experts import neural_expert
 from ppl_jax.intervention import RULES
 from ppl_jax.predictor import predict
 from ppl_jax.types import Env, Expert
@@ -30,11 +29,11 @@ def render(run: str, number: int, out: Path, steps: int, world: str = "driving")
     """Play a held-out scenario and write the film.
 
     Args:
-        run: Run folder, policy file, or "scripted".
+        run: Run folder, policy file, "scripted" or "neural".
         number: Of the scenario.
         out: .gif, .mp4 or .png (the last picture).
         steps: At most so many.
-        world: Where `run` is "scripted".
+        world: Where `run` is "scripted" or "neural".
 
     Raises:
         UserError: If one of them cannot be used.
@@ -43,14 +42,10 @@ def render(run: str, number: int, out: Path, steps: int, world: str = "driving")
         raise UserError(f"out must end in {', '.join(SUFFIXES)}, got {str(out)!r}")
     if steps < 1:
         raise UserError(f"steps must be at least 1, got {steps}")
-    scripted = run == "scripted"
-    name, options = (world, {}) if scripted else run_options(Path(run))
+    named = run in ("scripted", "neural")
+    name, options = (world, {}) if named else run_options(Path(run))
     env = make_world(name, options)
-    if scripted:
-        act = env.scripted_expert
-    else:
-        act = neural_expert(read_policy(policy_path(Path(run)), env.spec))
-    save_frames(out, episode(env, act, number, steps))
+    save_frames(out, episode(env, named_expert(run, env), number, steps))
 
 
 def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:

@@ -1,11 +1,15 @@
-"""What PPO is made of: generalised advantages, the clipped objective, Gaussian divergences."""
+"""What PPO-Lagrangian is made of: advantages, objective, divergence, statistics, multiplier."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
+import optax
+
+from ppl_jax.types import PyTree
 
 CLIP = 0.2  # epsilon
 
@@ -62,3 +66,97 @@ def gaussian_divergence(
     variance = jnp.exp(2 * log_std)
     spread = jnp.exp(2 * old_log_std) + (old_mean - mean) ** 2
     return jnp.sum(log_std - old_log_std + spread / (2 * variance) - 0.5, -1)
+
+
+def limited(grads: PyTree, norm: jax.Array | float) -> PyTree:
+    """Gradients with their norm clipped."""
+    clipped, _ = optax.clip_by_global_norm(norm).update(grads, optax.EmptyState())  # pyright: ignore
+    return clipped
+
+
+def mean_of_ended(values: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean over the episodes that ended (0 where none did), and whether any did."""
+    count = jnp.sum(done)
+    return jnp.sum(jnp.where(done, values, 0.0)) / jnp.maximum(count, 1), count > 0
+
+
+@flax.struct.dataclass
+class Running:
+    """Mean and variance of everything seen, merged batch by batch (Chan et al. 1979).
+
+    Attributes:
+        count: Values seen.
+        mean, square: Mean, and sum of squared deviations from it.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    square: jax.Array
+
+    def add(self, values: jax.Array) -> Running:
+        """With `values` [N, ...] as well."""
+        count, mean = values.shape[0], jnp.mean(values, 0)
+        square = jnp.sum((values - mean) ** 2, 0)
+        total, away = self.count + count, mean - self.mean
+        return Running(
+            total,
+            self.mean + away * (count / total),
+            self.square + square + away**2 * (self.count / total * count),
+        )
+
+    @property
+    def variance(self) -> jax.Array:
+        """Of the population; 0 before anything was seen."""
+        return self.square / jnp.maximum(self.count, 1.0)
+
+
+def no_values(shape: tuple[int, ...]) -> Running:
+    """Statistics of nothing yet."""
+    return Running(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
+
+
+@flax.struct.dataclass
+class Multiplier:
+    """lambda = softplus(p), with p's Adam.
+
+    Attributes:
+        p: Scalar.
+        opt_state: Of Adam.
+    """
+
+    p: jax.Array
+    opt_state: PyTree
+
+    @property
+    def value(self) -> jax.Array:
+        """lambda, >= 0."""
+        return jax.nn.softplus(self.p)
+
+
+_ADAM = optax.scale_by_adam()
+
+
+def init_multiplier(value: jax.Array | float) -> Multiplier:
+    """A multiplier that starts at `value` > 0: p = log(e^value - 1)."""
+    p = jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
+    return Multiplier(p, _ADAM.init(p))
+
+
+def update_multiplier(
+    multiplier: Multiplier,
+    cost: jax.Array,
+    limit: jax.Array | float,
+    rate: jax.Array | float,
+    known: jax.Array,
+) -> Multiplier:
+    """One step of Adam up the gradient J_C - d of p (J_C - d), where `known`.
+
+    Args:
+        multiplier: Before.
+        cost, limit: J_C, mean cost of the episodes that ended, and d.
+        rate: Adam's.
+        known: Whether any episode ended.
+    """
+    step, opt_state = _ADAM.update(limit - cost, multiplier.opt_state)
+    moved = Multiplier(multiplier.p - rate * jnp.asarray(step), opt_state)
+    return jax.tree.map(lambda new, old: jnp.where(known, new, old), moved, multiplier)

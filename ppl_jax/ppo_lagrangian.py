@@ -24,179 +24,37 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import layers, make_policy, make_raw
-from ppl_jax.policy_gradient import advantages, clipped_loss, gaussian_divergence
+from ppl_jax.policy_gradient import (
+    Multiplier,
+    Running,
+    advantages,
+    clipped_loss,
+    gaussian_divergence,
+    init_multiplier,
+    limited,
+    mean_of_ended,
+    no_values,
+    update_multiplier,
+)
+from ppl_jax.ppo_config import PPOConfig, PPOHParams
 from ppl_jax.types import Env, Expert, PyTree
 
 LAST_LAYER = 0.01  # the policy's last layer starts so much smaller: the first actions are near 0
 LEAST_SCALE = 0.1  # of an input, in the world's own scale: what hardly varies is not blown up
 CLONING_RATE = 1e-3  # Adam, falling to 0
 CLONING_BATCH = 1024
-
-
-@flax.struct.dataclass
-class PPOHParams:
-    """Traced settings.
-
-    Attributes:
-        learning_rate: Of Adam; it falls linearly to 0 over the run.
-        discount, smoothing: gamma and GAE's lambda, of reward and of cost.
-        clip: e.
-        max_divergence: Mean KL from the policy that played at which a batch's policy updates stop.
-        max_gradient: Norm to which gradients are clipped.
-        entropy_weight: Of the policy's entropy.
-        cost_limit: d, mean cost per episode.
-        initial_multiplier, multiplier_rate: lambda at the start, and Adam's rate for p.
-        initial_std, least_std: Of the actions, at the start and at least.
-        success_bonus: Added to the reward in the step that solves the task, while training. Where
-            solving it ends the episode and a state shortly before pays every step, return alone
-            would have the policy loiter there.
-        demonstration_noise: Standard deviation of the noise under which the expert demonstrates.
-    """
-
-    learning_rate: jax.Array | float = 3e-4
-    discount: jax.Array | float = 0.99
-    smoothing: jax.Array | float = 0.95
-    clip: jax.Array | float = 0.2
-    max_divergence: jax.Array | float = 0.02
-    max_gradient: jax.Array | float = 0.5
-    entropy_weight: jax.Array | float = 0.0
-    cost_limit: jax.Array | float = 1.0
-    initial_multiplier: jax.Array | float = 1.0
-    multiplier_rate: jax.Array | float = 0.01
-    initial_std: jax.Array | float = 0.5
-    least_std: jax.Array | float = 0.05
-    success_bonus: jax.Array | float = 0.0
-    demonstration_noise: jax.Array | float = 0.3
-
-
-@dataclasses.dataclass(frozen=True)
-class PPOConfig:
-    """What sets shapes and programs.
-
-    Attributes:
-        total_steps: Environment steps, rounded up to whole batches; demonstrations not counted.
-        worlds: Stepped side by side.
-        rollout_steps: Of each world per batch.
-        epochs, minibatches: Passes over a batch, and updates per pass.
-        hidden: Widths of the hidden layers of policy and critics.
-        scaling: Inputs are centred and scaled by running statistics of what was seen, or by the
-            world's constants.
-        demonstrations: Steps of a demonstrating expert, under noise, that the policy clones first.
-        cloning_updates: Updates of that.
-        critic_batches: Batches at the start in which only the critics learn.
-    """
-
-    total_steps: int = 20_000_000
-    worlds: int = 64
-    rollout_steps: int = 256
-    epochs: int = 5
-    minibatches: int = 8
-    hidden: tuple[int, ...] = (256, 256)
-    scaling: Literal["running", "world"] = "running"
-    demonstrations: int = 0
-    cloning_updates: int = 20_000
-    critic_batches: int = 0
-
-    @property
-    def batch_steps(self) -> int:
-        """Environment steps per batch."""
-        return self.worlds * self.rollout_steps
-
-    @property
-    def batches(self) -> int:
-        """Batches of the run."""
-        return -(-self.total_steps // self.batch_steps)
-
-
-@flax.struct.dataclass
-class Running:
-    """Mean and variance of everything seen, merged batch by batch (Chan et al. 1979).
-
-    Attributes:
-        count: Values seen.
-        mean, square: Mean, and sum of squared deviations from it.
-    """
-
-    count: jax.Array
-    mean: jax.Array
-    square: jax.Array
-
-    def add(self, values: jax.Array) -> Running:
-        """With `values` [N, ...] as well."""
-        count, mean = values.shape[0], jnp.mean(values, 0)
-        square = jnp.sum((values - mean) ** 2, 0)
-        total, away = self.count + count, mean - self.mean
-        return Running(
-            total,
-            self.mean + away * (count / total),
-            self.square + square + away**2 * (self.count / total * count),
-        )
-
-    @property
-    def variance(self) -> jax.Array:
-        """Of the population; 0 before anything was seen."""
-        return self.square / jnp.maximum(self.count, 1.0)
-
-
-def no_values(shape: tuple[int, ...]) -> Running:
-    """Statistics of nothing yet."""
-    return Running(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
-
-
-@flax.struct.dataclass
-class Multiplier:
-    """lambda = softplus(p), with p's Adam.
-
-    Attributes:
-        p: Scalar.
-        opt_state: Of Adam.
-    """
-
-    p: jax.Array
-    opt_state: PyTree
-
-    @property
-    def value(self) -> jax.Array:
-        """lambda, >= 0."""
-        return jax.nn.softplus(self.p)
-
-
-_ADAM = optax.scale_by_adam()
-
-
-def init_multiplier(value: jax.Array | float) -> Multiplier:
-    """A multiplier that starts at `value` > 0: p = log(e^value - 1)."""
-    p = jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
-    return Multiplier(p, _ADAM.init(p))
-
-
-def update_multiplier(
-    multiplier: Multiplier, cost: jax.Array, limit: jax.Array, rate: jax.Array, known: jax.Array
-) -> Multiplier:
-    """One step of Adam up the gradient J_C - d of p (J_C - d), where `known`.
-
-    Args:
-        multiplier: Before.
-        cost, limit: J_C, mean cost of the episodes that ended, and d.
-        rate: Adam's.
-        known: Whether any episode ended.
-    """
-    step, opt_state = _ADAM.update(-(cost - limit), multiplier.opt_state)
-    moved = Multiplier(multiplier.p - rate * step, opt_state)
-    return jax.tree.map(lambda new, old: jnp.where(known, new, old), moved, multiplier)
 
 
 @flax.struct.dataclass
@@ -288,41 +146,6 @@ class PPOFunctions(NamedTuple):
     critics: Callable[[PPOLearner, jax.Array], jax.Array]
 
 
-def validate(config: PPOConfig, hparams: PPOHParams) -> None:
-    """Check settings before anything compiles.
-
-    Raises:
-        ValueError: One line naming field, value and what is allowed.
-    """
-    for field in ("total_steps", "worlds", "rollout_steps", "epochs", "minibatches"):
-        if getattr(config, field) < 1:
-            raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")
-    for field in ("demonstrations", "cloning_updates", "critic_batches"):
-        if getattr(config, field) < 0:
-            raise ValueError(f"{field} must not be negative, got {getattr(config, field)}")
-    if not config.hidden or min(config.hidden) < 1:
-        raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
-    if config.batch_steps % config.minibatches:
-        raise ValueError(
-            f"minibatches must divide worlds x rollout_steps ({config.batch_steps}), got "
-            f"{config.minibatches}"
-        )
-    for name, value in dataclasses.asdict(hparams).items():
-        above = name in ("initial_multiplier", "initial_std", "least_std", "clip", "max_gradient")
-        if not (value > 0 if above else value >= 0) or not np.isfinite(value):
-            what = "positive" if above else "a number of 0 or more"
-            raise ValueError(f"{name} must be {what}, got {value}")
-    for name in ("discount", "smoothing"):
-        if getattr(hparams, name) > 1:
-            raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")
-
-
-def mean_of_ended(values: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean over the episodes that ended (0 where none did), and whether any did."""
-    count = jnp.sum(done)
-    return jnp.sum(jnp.where(done, values, 0.0)) / jnp.maximum(count, 1), count > 0
-
-
 def make_ppo_lagrangian(
     env: Env, config: PPOConfig, env_params: PyTree | None = None, expert: Expert | None = None
 ) -> PPOFunctions:
@@ -330,10 +153,15 @@ def make_ppo_lagrangian(
 
     Args:
         env: Any world; without costs this is PPO.
-        config: Static settings; check them with `validate` first.
+        config: Static settings; check them with `ppl_jax.ppo_config.validate` first.
         env_params: The world's parameters; its training ones where None.
         expert: Demonstrates, where `config.demonstrations` asks for it.
+
+    Raises:
+        ValueError: If demonstrations are asked for and there is no expert.
     """
+    if config.demonstrations and expert is None:
+        raise ValueError(f"demonstrations: {env.name} has no expert to give them")
     params = env.default_params if env_params is None else env_params
     spec = env.spec
     size = spec.observation_size
@@ -464,6 +292,8 @@ def make_ppo_lagrangian(
         multiplier = learned.multiplier.value
         progress = batch / config.batches
         rate = hparams.learning_rate * jnp.clip(1.0 - progress, 0.0, 1.0)
+        shrunk = jnp.log(hparams.final_std) - jnp.log(hparams.initial_std)
+        most_log_std = jnp.log(hparams.initial_std) + progress * shrunk
         critics_only = batch < config.critic_batches
 
         def policy_loss(network: Any, at: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -486,8 +316,9 @@ def make_ppo_lagrangian(
             def move(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
                 grads, away = jax.grad(policy_loss, has_aux=True)(actor.params, at)
                 actor = adam_step(actor, limited(grads, hparams.max_gradient), rate)
-                floor = jnp.maximum(actor.params["log_std"], jnp.log(hparams.least_std))
-                moved = actor.params | {"log_std": floor}
+                log_std = jnp.minimum(actor.params["log_std"], most_log_std)
+                log_std = jnp.maximum(log_std, jnp.log(hparams.least_std))
+                moved = actor.params | {"log_std": log_std}
                 return dataclasses.replace(actor, params=moved), (away, jnp.ones(()))
 
             def stay(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
@@ -561,15 +392,15 @@ def make_ppo_lagrangian(
 
         What is cloned is its action without the noise, which shows it how to get back.
         """
-        assert expert is not None
+        assert expert is not None  # see `make_ppo_lagrangian`
+        demonstrate = jax.vmap(expert, in_axes=(0, 0, 0, None))
         length = -(-config.demonstrations // config.worlds)
 
         def show(learner: PPOLearner, _: None) -> Any:
             key, key_expert, key_noise, key_step = jax.random.split(learner.key, 4)
             observation = learner.observation
-            action = jax.vmap(expert, in_axes=(0, 0, 0, None))(
-                jax.random.split(key_expert, config.worlds), learner.env_state, observation, params
-            )
+            keys = jax.random.split(key_expert, config.worlds)
+            action = demonstrate(keys, learner.env_state, observation, params)
             noise = learner.hparams.demonstration_noise * jax.random.normal(key_noise, action.shape)
             learner = dataclasses.replace(learner, key=key)
             learner, row = step_worlds(key_step, learner, action + noise)
@@ -626,9 +457,3 @@ def make_ppo_lagrangian(
         return values(learner.learned, scaled(learner.learned.inputs, observation))
 
     return PPOFunctions(init, clone, run, saved, critics)
-
-
-def limited(grads: PyTree, norm: jax.Array) -> PyTree:
-    """Gradients with their norm clipped."""
-    clipped, _ = optax.clip_by_global_norm(norm).update(grads, optax.EmptyState())  # pyright: ignore
-    return clipped

@@ -74,6 +74,16 @@ class Probe(Environment):
         return jnp.atleast_1d(Probe.answer(state.sign))
 
 
+class Aim(Probe):
+    """The same where a step pays 1 less the miss, so that failing at once does not pay."""
+
+    name = "aim"
+
+    def transition(self, key, state, action, params):
+        state, outcome = super().transition(key, state, action, params)
+        return state, outcome.replace(reward=1.0 + outcome.reward)
+
+
 @flax.struct.dataclass
 class GoalState:
     place: jax.Array
@@ -207,7 +217,7 @@ class TwoSteps(Goal):
 
 
 class Endless(TwoSteps):
-    """Every step pays 1, time alone ends it and the observation never changes: V = 1 / (1 - gamma)."""
+    """Every step pays 1, time alone ends it, all looks the same: V = 1 / (1 - gamma)."""
 
     name = "endless"
     max_episode_steps = 3

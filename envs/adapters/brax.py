@@ -135,7 +135,7 @@ class FromBrax(Environment):
         )
 
     def observe(self, state: BraxState, params: BraxParams) -> jax.Array:
-        """brax's observation."""
+        """The observation, as it is in brax."""
         del params
         return state.inner.obs
 

@@ -1,0 +1,125 @@
+"""Settings of PPO-Lagrangian: `PPOHParams` are traced, `PPOConfig` is static."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import flax.struct
+import jax
+import numpy as np
+
+
+@flax.struct.dataclass
+class PPOHParams:
+    """Traced settings.
+
+    Attributes:
+        learning_rate: Of Adam; it falls linearly to 0 over the run.
+        discount, smoothing: gamma and GAE's lambda, of reward and of cost.
+        clip: e.
+        max_divergence: Mean KL from the policy that played at which a batch's policy updates stop.
+        max_gradient: Norm to which gradients are clipped.
+        entropy_weight: Of the policy's entropy.
+        cost_limit: d, mean cost per episode.
+        initial_multiplier, multiplier_rate: lambda at the start, and Adam's rate for p.
+        initial_std, least_std: Of the actions, at the start and at least.
+        final_std: Bound on it at the end; from `initial_std` it moves there geometrically. Noise
+            that is clipped at the action box changes what a policy does on average, so that one
+            evaluated without noise had better have been trained with little of it.
+        success_bonus: Added to the reward in the step that solves the task, while training. Where
+            solving it ends the episode and a state shortly before pays every step, return alone
+            would have the policy loiter there.
+        demonstration_noise: Standard deviation of the noise under which the expert demonstrates.
+    """
+
+    learning_rate: jax.Array | float = 3e-4
+    discount: jax.Array | float = 0.99
+    smoothing: jax.Array | float = 0.95
+    clip: jax.Array | float = 0.2
+    max_divergence: jax.Array | float = 0.02
+    max_gradient: jax.Array | float = 0.5
+    entropy_weight: jax.Array | float = 0.0
+    cost_limit: jax.Array | float = 1.0
+    initial_multiplier: jax.Array | float = 1.0
+    multiplier_rate: jax.Array | float = 0.01
+    initial_std: jax.Array | float = 0.5
+    least_std: jax.Array | float = 0.05
+    final_std: jax.Array | float = 1.0
+    success_bonus: jax.Array | float = 0.0
+    demonstration_noise: jax.Array | float = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """What sets shapes and programs.
+
+    Attributes:
+        total_steps: Environment steps, rounded up to whole batches; demonstrations not counted.
+        worlds: Stepped side by side.
+        rollout_steps: Of each world per batch.
+        epochs, minibatches: Passes over a batch, and updates per pass.
+        hidden: Widths of the hidden layers of policy and critics.
+        scaling: Inputs are centred and scaled by running statistics of what was seen, or by the
+            world's constants.
+        demonstrations: Steps of a demonstrating expert, under noise, that the policy clones first.
+        cloning_updates: Updates of that.
+        critic_batches: Batches at the start in which only the critics learn.
+    """
+
+    total_steps: int = 20_000_000
+    worlds: int = 64
+    rollout_steps: int = 256
+    epochs: int = 5
+    minibatches: int = 8
+    hidden: tuple[int, ...] = (256, 256)
+    scaling: Literal["running", "world"] = "running"
+    demonstrations: int = 0
+    cloning_updates: int = 20_000
+    critic_batches: int = 0
+
+    @property
+    def batch_steps(self) -> int:
+        """Environment steps per batch."""
+        return self.worlds * self.rollout_steps
+
+    @property
+    def batches(self) -> int:
+        """Batches of the run."""
+        return -(-self.total_steps // self.batch_steps)
+
+
+def validate(config: PPOConfig, hparams: PPOHParams) -> None:
+    """Check settings before anything compiles.
+
+    Raises:
+        ValueError: One line naming field, value and what is allowed.
+    """
+    for field in ("total_steps", "worlds", "rollout_steps", "epochs", "minibatches"):
+        if getattr(config, field) < 1:
+            raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")
+    for field in ("demonstrations", "cloning_updates", "critic_batches"):
+        if getattr(config, field) < 0:
+            raise ValueError(f"{field} must not be negative, got {getattr(config, field)}")
+    if not config.hidden or min(config.hidden) < 1:
+        raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
+    if config.batch_steps % config.minibatches:
+        raise ValueError(
+            f"minibatches must divide worlds x rollout_steps ({config.batch_steps}), got "
+            f"{config.minibatches}"
+        )
+    for name, value in dataclasses.asdict(hparams).items():
+        above = name in (
+            "initial_multiplier",
+            "initial_std",
+            "least_std",
+            "final_std",
+            "clip",
+            "max_gradient",
+        )
+        if not (value > 0 if above else value >= 0) or not np.isfinite(value):
+            what = "positive" if above else "a number of 0 or more"
+            raise ValueError(f"{name} must be {what}, got {value}")
+    for name in ("discount", "smoothing"):
+        if getattr(hparams, name) > 1:
+            raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")
