@@ -302,12 +302,23 @@ class ExpertEvaluate:
 
 
 @dataclasses.dataclass
+class ExpertCard:
+    """Write a trained expert's policy, its curve and a card that says how it was made."""
+
+    run: Positional[Path]
+    """Run folder of `ppl expert train`."""
+    out: Path = Path("envs/pretrained")
+    """Folder to write to."""
+
+
+@dataclasses.dataclass
 class Expert:
-    """Train or evaluate an expert."""
+    """Train, evaluate or describe an expert."""
 
     command: OmitSubcommandPrefixes[
         Annotated[ExpertTrain, subcommand("train")]
         | Annotated[ExpertEvaluate, subcommand("evaluate")]
+        | Annotated[ExpertCard, subcommand("card")]
     ]
     """What to do."""
 
@@ -488,8 +499,12 @@ def _tune(command: Tune) -> None:
 def _expert(command: Expert) -> None:
     if isinstance(command.command, ExpertTrain):
         _expert_train(command.command)
-    else:
+    elif isinstance(command.command, ExpertEvaluate):
         _expert_evaluate(command.command)
+    else:
+        from experiments.card import write_card
+
+        write_card(command.command.run, command.command.out)
 
 
 def _expert_train(command: ExpertTrain) -> None:

@@ -7,6 +7,7 @@ import functools
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -129,9 +130,9 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
     """The world of a run folder (or of a policy file's meta) and how it was built."""
     if run.is_file():
         try:
-            with np.load(run, allow_pickle=False) as archive:
+            with open(run, "rb") as file, np.load(file, allow_pickle=False) as archive:
                 return json.loads(str(archive["meta"]))["env"], {}
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise UserError(f"policy file {str(run)!r} cannot be read: {error}") from error
     try:
         config = RunFolder(run).config()

@@ -52,13 +52,13 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     """
     name = f"policy file {str(path)!r}"
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             files = {name: archive[name] for name in archive.files}
         count = sum(name[0] == "w" and name[1:].isdigit() for name in files)
         weights = [(files[f"w{i}"], files[f"b{i}"]) for i in range(count)]
         activation, output = str(files["activation"]), str(files["output"])
         version = int(files.get("version", VERSION))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{name} cannot be read: {error}") from error
     if version > VERSION:
         raise ValueError(f"{name} has version {version}; this program reads up to {VERSION}")

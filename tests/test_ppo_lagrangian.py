@@ -35,7 +35,16 @@ def coins(*shape):
 @functools.cache
 def functions(world, config=TINY):
     made = make_ppo_lagrangian(world(), config, expert=getattr(world, "scripted_expert", None))
-    return made, jax.jit(made.run, static_argnums=1), jax.jit(made.init)
+    batch = jax.jit(lambda learner: made.run(learner, 1))  # one program for any number of batches
+
+    def run(learner, batches):
+        rows = []
+        for _ in range(batches):
+            learner, metrics = batch(learner)
+            rows.append(metrics)
+        return learner, jax.tree.map(lambda *values: np.concatenate(values), *rows)
+
+    return made, run, jax.jit(made.init)
 
 
 def train(world, batches=200, seed=0, config=TINY, **changes):
@@ -234,10 +243,10 @@ def test_at_first_the_critics_alone_learn():
 
 
 def test_stopping_and_going_on_is_never_having_stopped():
-    _, run, init = functions(Goal)
+    made, run, init = functions(Goal)
     start = init(jax.random.key(3), PPOHParams())
-    whole, _ = run(start, 2)
-    halves, _ = run(run(start, 1)[0], 1)
+    whole, _ = jax.jit(made.run, static_argnums=1)(start, 2)
+    halves, _ = run(start, 2)
     for a, b in zip(jax.tree.leaves(whole.learned), jax.tree.leaves(halves.learned), strict=True):
         np.testing.assert_array_equal(a, b)
 
