@@ -1,10 +1,15 @@
-"""Figures, from result files only: `python -m experiments.figures RESULTS.csv OUT.png`."""
+"""Figures, from result files only: `python -m experiments.figures RESULTS.csv OUT.png`.
+
+With a folder of experts' curves (`envs/pretrained`) in the place of RESULTS.csv it draws those.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,7 +83,59 @@ def learning_curves(results: Path, out: Path, column: str = "success") -> None:
     pyplot.close(figure)
 
 
+def expert_curves(folder: Path, out: Path) -> None:
+    """Success, cost and multiplier over the training of each expert in a folder.
+
+    Args:
+        folder: With a NAME.csv and a NAME.json for each, as `ppl expert card` writes them.
+        out: Picture to write.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    paths = sorted(folder.glob("*.csv"))
+    figure, rows = pyplot.subplots(len(paths), 3, figsize=(11, 2.6 * len(paths)), squeeze=False)
+    for (success, cost, multiplier), path in zip(rows, paths, strict=True):
+        limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
+        with open(path, newline="") as file:
+            table = [
+                {k: float(v) if v else np.nan for k, v in row.items()}
+                for row in csv.DictReader(file)
+            ]
+        steps = np.array([row["step"] for row in table]) / 1e6
+
+        def line(axes: Any, column: str, label: str, colour: str, steps=steps, table=table) -> None:
+            axes.plot(steps, [row[column] for row in table], color=colour, label=label)
+
+        line(success, "held_out_success_rate", "held out", "tab:blue")
+        line(success, "train_success_rate", "in training", "tab:orange")
+        success.set_ylim(0, 1.03)
+        success.set_ylabel(f"{path.stem}\nsuccess")
+        line(cost, "held_out_episodic_cost", "held out", "tab:blue")
+        line(cost, "train_episodic_cost", "in training", "tab:orange")
+        cost.axhline(limit, color="black", linewidth=0.8, linestyle="--", label="limit")
+        cost.set_yscale("symlog", linthresh=1)
+        cost.set_ylim(bottom=0)
+        cost.set_ylabel("cost per episode")
+        line(multiplier, "train_multiplier", "multiplier", "tab:green")
+        multiplier.set_ylabel("multiplier")
+        multiplier.set_ylim(bottom=0)
+        for axes in (success, cost, multiplier):
+            axes.grid(alpha=0.25)
+            axes.spines[["top", "right"]].set_visible(False)
+    for axes in rows[-1]:
+        axes.set_xlabel("environment steps, millions")
+    rows[0][0].legend(frameon=False)
+    rows[0][1].legend(frameon=False)
+    figure.tight_layout()
+    figure.savefig(out, dpi=120)
+    pyplot.close(figure)
+
+
 _OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
 
 if __name__ == "__main__":
-    learning_curves(Path(sys.argv[1]), Path(sys.argv[2]))
+    draw = expert_curves if Path(sys.argv[1]).is_dir() else learning_curves
+    draw(Path(sys.argv[1]), Path(sys.argv[2]))
