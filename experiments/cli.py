@@ -66,12 +66,14 @@ class Train:
     """Of Adam."""
     min_speed: float | None = None
     """Gate: predicted mean speed below which the expert takes over, m/s."""
-    gate: Literal["unsafe_or_slow", "low_return", "departs"] | None = None
+    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] | None = None
     """What makes the expert take over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
     """Gate departs: how far from the expert's own path, in the world's units."""
+    min_log_density: float | None = None
+    """Gate unlikely: log-density under a neural expert below which it takes over."""
     discount: float | None = None
     """gamma, of methods with action values."""
     target_rate: float | None = None
@@ -140,12 +142,14 @@ class Compare:
     """Environment steps of each run (bc and gail keep their own)."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
-    gate: Literal["unsafe_or_slow", "low_return", "departs"] | None = None
+    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] | None = None
     """What makes the expert take over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
     """Gate departs: how far from the expert's own path, in the world's units."""
+    min_log_density: float | None = None
+    """Gate unlikely: log-density under a neural expert below which it takes over."""
     batch_size: int | None = None
     """Samples per loss and update."""
     preset: Literal["default", "paper", "reference"] = "default"

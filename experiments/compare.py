@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Settings = Ablation | Compare | Tune
 
-OPTIONS = ("preset", "gate", "min_return", "max_departure", "batch_size")
+OPTIONS = ("preset", "gate", "min_return", "max_departure", "min_log_density", "batch_size")
 OPTIONS += ("expert", "scenarios", "held_out_scenarios")
 
 

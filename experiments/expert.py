@@ -78,10 +78,18 @@ def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
         demonstration_noise=0.2,
     )
     if env == "driving":
-        # many maps: the novice's fifty would be learnt by heart. Discounted by 0.99, twice the
-        # speed is worth more than a good chance to arrive
+        # Many maps: the novice's fifty would be learnt by heart. Discounted by 0.99, twice the speed
+        # is worth more than a good chance to arrive. And with a multiplier of 1 from the start the
+        # car leaves the road, which costs once, rather than touch something, which costs per step.
         config = dataclasses.replace(config, demonstrations=500_000)
-        hparams = hparams.replace(discount=0.999, cost_limit=0.5, initial_std=0.15, final_std=0.05)
+        hparams = hparams.replace(
+            discount=0.999,
+            cost_limit=0.5,
+            initial_multiplier=0.05,
+            success_bonus=100.0,
+            initial_std=0.15,
+            final_std=0.05,
+        )
         return config, hparams, 1000
     config = dataclasses.replace(config, scaling="world")
     # where hovering over the last marker or the peg pays for ever, solving the task must pay more

@@ -30,6 +30,7 @@ class HParams:
             at or below (the paper's epsilon).
         max_departure: Gate "departs": how far the prediction may end from where the expert would,
             in the world's units (`WorldSpec.observation_scale`).
+        min_log_density: Gate "unlikely": log-density under the expert below which it takes over.
         discount, target_rate: gamma, and tau of target networks (methods with critics).
         margin: EIL: hinge margins of its action values.
         conservative_weight: HACO: c, weight of raising expert's over novice's action values.
@@ -53,6 +54,7 @@ class HParams:
     min_speed: jax.Array | float = 5.0
     min_return: jax.Array | float = 10.0
     max_departure: jax.Array | float = 1.0
+    min_log_density: jax.Array | float = -3.0
     discount: jax.Array | float = 0.99
     target_rate: jax.Array | float = 0.005
     margin: jax.Array | float = 0.1
@@ -82,7 +84,8 @@ class TrainConfig:
         predictor: The world's own transition, or the rule-based kinematic one.
         gate: What makes the expert take over: an unsafe or slow prediction, a low return, or one
             that departs from what the expert would do from here (one more lookahead per decision;
-            it asks the policy again at every predicted state).
+            it asks the policy again at every predicted state), or an action that the expert
+            finds unlikely (neural experts alone).
         gate_rollout: The lookahead holds the proposed action, or asks the policy again at every
             predicted state.
         pair_states: Pairs at predicted states 1..L, or as the released code makes them: preferred
@@ -110,7 +113,7 @@ class TrainConfig:
     human_capacity: int = 50_000
     preference_capacity: int = 50_000
     predictor: Literal["simulator", "kinematic"] = "simulator"
-    gate: Literal["unsafe_or_slow", "low_return", "departs"] = "unsafe_or_slow"
+    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] = "unsafe_or_slow"
     gate_rollout: Literal["constant", "closed_loop"] = "constant"
     pair_states: Literal["predicted", "shifted"] = "predicted"
     likelihood: Literal["gaussian", "laplace"] = "gaussian"
@@ -279,6 +282,10 @@ def validate(config: TrainConfig, hparams: HParams) -> None:
         value = jnp.asarray(getattr(hparams, field))
         if not bool(jnp.all(value >= 0)):  # catches NaN too
             raise ValueError(f"{field} must not be negative, got {_show(value)}")
+    for field in ("min_return", "min_log_density"):
+        value = jnp.asarray(getattr(hparams, field))
+        if bool(jnp.any(jnp.isnan(value))):
+            raise ValueError(f"{field} must be a number, got {_show(value)}")
     for field in _SHARES:
         value = jnp.asarray(getattr(hparams, field))
         if not bool(jnp.all((value >= 0) & (value <= 1))):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -58,7 +59,11 @@ def log_density(policy: SavedPolicy, observation: jax.Array, action: jax.Array) 
 
 
 def neural_expert(policy: SavedPolicy) -> Expert:
-    """An expert that acts as a saved policy does."""
+    """An expert that acts as a saved policy does.
+
+    Where the policy has a standard deviation, the expert has an attribute `log_density`, a function
+    of observation and action.
+    """
     arrays = jax.tree.map(jnp.asarray, (list(policy.weights), policy.obs_mean, policy.obs_scale))
     weights, mean, scale = arrays
     policy = policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
@@ -67,4 +72,6 @@ def neural_expert(policy: SavedPolicy) -> Expert:
         del key, state, params
         return act(policy, observation)
 
+    if policy.log_std is not None:
+        expert.log_density = functools.partial(log_density, policy)  # pyright: ignore[reportFunctionMemberAccess]
     return expert

@@ -70,7 +70,14 @@ Gate = Callable[[Any, DecisionPoint, HParams], jax.Array]
 
 
 def make_gate(name: str, scale: Scale) -> Gate:
-    """The gate that a `TrainConfig.gate` names, as the methods that share it use it."""
+    """The gate that a `TrainConfig.gate` names, as the methods that share it use it.
+
+    "unlikely" looks at no prediction: the expert takes over where it gives the novice's action a
+    log-density below `min_log_density` (EGPO, Peng et al. 2021; PVP's "free level" 0.95 is a
+    density of 0.05).
+    """
+    if name == "unlikely":
+        return unlikely
     rule = RULES[name]
 
     def decide(state: Any, point: DecisionPoint, hparams: HParams) -> jax.Array:
@@ -78,6 +85,12 @@ def make_gate(name: str, scale: Scale) -> Gate:
         return rule(point.trajectory, point.experts, hparams, scale)
 
     return decide
+
+
+def unlikely(state: Any, point: DecisionPoint, hparams: HParams) -> jax.Array:
+    """The expert would hardly have done that."""
+    del state
+    return point.log_density < hparams.min_log_density
 
 
 def never(state: Any, point: DecisionPoint, hparams: HParams) -> jax.Array:

@@ -122,14 +122,22 @@ def make_train(
         env_params: The world's parameters; its training ones where None.
 
     Raises:
-        ValueError: If the world lacks the predictor that `config` names, or the run's length does
-            not fit the method's rounds.
+        ValueError: If the world lacks the predictor that `config` names, the expert the density
+            that its gate needs, or the run's length does not fit the method's rounds.
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
     transition = selected_transition(env, config.predictor)
     interval = config.decision_interval
     check_rounds(algorithm, config)
+    density = getattr(expert, "log_density", None)
+    if density is None:
+        if config.gate == "unlikely":
+            raise ValueError(
+                "gate 'unlikely' needs an expert with a density, such as a neural one: give one, "
+                "or another gate"
+            )
+        density = lambda observation, action: jnp.nan  # noqa: E731
 
     def init(key: jax.Array, hparams: HParams) -> Learner:
         key, key_algorithm, key_env = jax.random.split(key, 3)
@@ -185,6 +193,7 @@ def make_train(
             takeover=learner.takeover,
             trajectory=roll(act=act if asked_again else None),
             experts=roll(expert=expert) if algorithm.compares else None,
+            log_density=jnp.asarray(density(observation, jnp.clip(action, -1.0, 1.0))),
         )
         return algorithm.decide(learner.algorithm, point, learner.hparams)
 

@@ -114,6 +114,8 @@ class DecisionPoint:
         takeover: The expert has been in control until now.
         trajectory: Where the novice's action is predicted to lead.
         experts: Where the expert's are, if the method asks for it, else None.
+        log_density: Log of the density that the expert gives to the novice's action; NaN where the
+            expert has none (`ppl_jax.experts.log_density`).
     """
 
     observation: jax.Array
@@ -122,6 +124,7 @@ class DecisionPoint:
     takeover: jax.Array
     trajectory: Trajectory
     experts: Trajectory | None
+    log_density: jax.Array
 
 
 @flax.struct.dataclass

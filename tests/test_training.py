@@ -54,6 +54,37 @@ def test_probe_worlds_are_solved(algorithm, dependent):
     assert int(learner.counters.human_data) < 400  # the expert is needed less and less
 
 
+def test_a_gate_by_action_probability():
+    """The expert takes over where its density of the novice's action is low, and nowhere else."""
+    probe, weight = Probe(), np.zeros((3, 1), np.float32)
+    weight[0] = np.arctanh(0.6)
+    policy = experts.SavedPolicy(
+        [(weight, np.zeros(1))], "relu", "tanh", np.zeros(3), np.ones(3), np.log([0.2])
+    )
+    expert = experts.neural_expert(policy)
+    np.testing.assert_allclose(expert(None, None, jnp.array([-1.0, 0.3, 1.0]), None), [-0.6])
+    config = dataclasses.replace(TINY, gate="unlikely")
+    fns = make_train(probe, expert, make_ppl, config)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP.replace(min_log_density=-1.0))
+    assert success(probe, fns, learner) == 1.0
+    assert 0 < int(learner.counters.human_data) < 400
+    run = jax.jit(lambda learner: fns.run_chunk(learner, 1))
+    for wrong, takes_over in ((0.6, False), (0.55, False), (-0.6, True), (0.0, True)):
+        # at -1: a distance of 0.44 or more is that unlikely
+        start = fns.init(jax.random.key(1), HP.replace(min_log_density=-1.0, learning_rate=0.0))
+        bias = jnp.arctanh(wrong * start.env_state.sign)
+        start = jax.tree.map(jnp.zeros_like, start.algorithm.learned.params), start
+        params = {**start[0]}
+        last = params["params"]["Dense_1"]
+        last["bias"] = last["bias"] + bias
+        learned = dataclasses.replace(start[1].algorithm.learned, params=params)
+        algorithm = dataclasses.replace(start[1].algorithm, learned=learned)
+        after, _ = run(dataclasses.replace(start[1], algorithm=algorithm))
+        assert (int(after.counters.human_data) > 0) == takes_over
+    with pytest.raises(ValueError, match="gate 'unlikely' needs an expert with a density"):
+        make_train(probe, probe.scripted_expert, make_ppl, config)
+
+
 def test_the_released_settings_run_and_solve_the_probe():
     probe = Probe()
     config, hparams = reference()
