@@ -126,6 +126,34 @@ class Rollout:
     ended: Played  # of the episode, up to and with this step
 
 
+@flax.struct.dataclass
+class Batch:
+    """A rollout as it is learnt from, [N] steps.
+
+    Attributes:
+        inputs: [N, O] scaled observations.
+        action: [N, A].
+        mean, log_std: [N, A], [A] of the policy that played.
+        log_prob: [N] that it gave the action.
+        gain, cost_gain: [N] A standardised, A_C centred.
+        target: [N, 2] of the critics, in their unit.
+    """
+
+    inputs: jax.Array
+    action: jax.Array
+    mean: jax.Array
+    log_std: jax.Array
+    log_prob: jax.Array
+    gain: jax.Array
+    cost_gain: jax.Array
+    target: jax.Array
+
+    def rows(self, at: jax.Array) -> Batch:
+        """The steps of these numbers."""
+        chosen = jax.tree.map(lambda x: x[at], self.replace(log_std=None))
+        return chosen.replace(log_std=self.log_std)
+
+
 class PPOFunctions(NamedTuple):
     """What `make_ppo_lagrangian` returns; all pure, jittable and vmappable.
 
@@ -169,7 +197,6 @@ def make_ppo_lagrangian(
         observation_mean=np.zeros(size, np.float32), observation_scale=np.ones(size, np.float32)
     )
     policy, critic = make_policy(plain, config.hidden), make_raw(plain, config.hidden, 1)
-    rows = config.batch_steps // config.minibatches
 
     def init(key: jax.Array, hparams: PPOHParams) -> PPOLearner:
         key, key_policy, key_critics, key_env = jax.random.split(key, 4)
@@ -178,10 +205,6 @@ def make_ppo_lagrangian(
         last = f"Dense_{len(config.hidden)}"
         network["params"][last]["kernel"] = LAST_LAYER * network["params"][last]["kernel"]
         log_std = jnp.broadcast_to(jnp.log(hparams.initial_std), (spec.action_size,))
-        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
-            jax.random.split(key_env, config.worlds), params
-        )
-        zero = jnp.zeros(config.worlds)
         return PPOLearner(
             learned=PPOLearned(
                 policy=init_learned({"mean": network, "log_std": log_std}),
@@ -190,14 +213,18 @@ def make_ppo_lagrangian(
                 inputs=no_values((size,)),
                 returns=no_values((2,)),
             ),
-            env_state=env_state,
-            observation=observation,
-            played=Played(zero, zero, zero),
+            **start_worlds(key_env),
             key=key,
             hparams=hparams,
             batches=jnp.zeros((), jnp.int32),
             diverged=jnp.zeros((), bool),
         )
+
+    def start_worlds(key: jax.Array) -> dict[str, Any]:
+        keys, zero = jax.random.split(key, config.worlds), jnp.zeros(config.worlds)
+        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+        played = Played(zero, zero, zero)
+        return {"observation": observation, "env_state": env_state, "played": played}
 
     def centre_and_scale(inputs: Running) -> tuple[jax.Array, jax.Array]:
         mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
@@ -268,27 +295,41 @@ def make_ppo_lagrangian(
 
         return jax.lax.scan(step, learner, None, length=config.rollout_steps)
 
-    def improve(
-        learned: PPOLearned, steps: Rollout, key: jax.Array, hparams: PPOHParams, batch: jax.Array
-    ) -> tuple[PPOLearned, Metrics]:
-        """The epochs over one batch."""
+    def prepare(
+        learned: PPOLearned, steps: Rollout, hparams: PPOHParams
+    ) -> tuple[PPOLearned, Batch, Metrics]:
+        """Advantages, targets and densities of a batch before it is learnt from."""
         inputs = scaled(learned.inputs, steps.observation)
         before = values(learned, inputs)
         after = values(learned, scaled(learned.inputs, steps.final_observation))
         signal = jnp.stack([steps.reward, steps.cost], -1)
         ends = steps.terminated[..., None], steps.done[..., None]
         gain = advantages(signal, before, after, *ends, hparams.discount, hparams.smoothing)
-        flat = config.batch_steps
-        returns = learned.returns.add(jnp.reshape((gain + before) ** 2, (flat, 2)))
-        target = jnp.reshape(gain + before, (flat, 2)) / unit(returns)
-        gain = jnp.reshape(gain, (flat, 2))
+        inputs, action, gain, target = (
+            jnp.reshape(x, (config.batch_steps, -1))
+            for x in (inputs, steps.action, gain, gain + before)
+        )
+        returns = learned.returns.add(target**2)
         gain, spread = gain - jnp.mean(gain, 0), jnp.std(gain, 0)
-        gain_reward, gain_cost = gain[:, 0] / (spread[0] + 1e-8), gain[:, 1]
-        inputs = jnp.reshape(inputs, (flat, size))
-        action = jnp.reshape(steps.action, (flat, -1))
-        old_mean = policy.apply(learned.policy.params["mean"], inputs)
-        old_log_std = learned.policy.params["log_std"]
-        old = gaussian_log_prob(old_mean, old_log_std, action)
+        mean = policy.apply(learned.policy.params["mean"], inputs)
+        log_std = learned.policy.params["log_std"]
+        batch = Batch(
+            inputs=inputs,
+            action=action,
+            mean=mean,
+            log_std=log_std,
+            log_prob=gaussian_log_prob(mean, log_std, action),
+            gain=gain[:, 0] / (spread[0] + 1e-8),
+            cost_gain=gain[:, 1],
+            target=target / unit(returns),
+        )
+        metrics = {"advantage_std": spread[0], "cost_advantage_std": spread[1]}
+        return dataclasses.replace(learned, returns=returns), batch, metrics
+
+    def improve(
+        learned: PPOLearned, made: Batch, key: jax.Array, hparams: PPOHParams, batch: jax.Array
+    ) -> tuple[PPOLearned, Metrics]:
+        """The epochs over one batch."""
         multiplier = learned.multiplier.value
         progress = batch / config.batches
         rate = hparams.learning_rate * jnp.clip(1.0 - progress, 0.0, 1.0)
@@ -296,25 +337,26 @@ def make_ppo_lagrangian(
         most_log_std = jnp.log(hparams.initial_std) + progress * shrunk
         critics_only = batch < config.critic_batches
 
-        def policy_loss(network: Any, at: jax.Array) -> tuple[jax.Array, jax.Array]:
-            mean = policy.apply(network["mean"], inputs[at])
-            new = gaussian_log_prob(mean, network["log_std"], action[at])
-            loss = clipped_loss(new, old[at], gain_reward[at], hparams.clip)
+        def policy_loss(network: Any, rows: Batch) -> tuple[jax.Array, jax.Array]:
+            mean, log_std = policy.apply(network["mean"], rows.inputs), network["log_std"]
+            new = gaussian_log_prob(mean, log_std, rows.action)
+            loss = clipped_loss(new, rows.log_prob, rows.gain, hparams.clip)
             # max(rho A, clip(rho) A) = -min(rho (-A), clip(rho) (-A))
-            loss = loss + multiplier * clipped_loss(new, old[at], -gain_cost[at], hparams.clip)
-            entropy = jnp.sum(network["log_std"])
-            away = gaussian_divergence(old_mean[at], old_log_std, mean, network["log_std"])
+            cost = clipped_loss(new, rows.log_prob, -rows.cost_gain, hparams.clip)
+            loss, entropy = loss + multiplier * cost, jnp.sum(log_std)
+            away = gaussian_divergence(rows.mean, rows.log_std, mean, log_std)
             return loss / (1 + multiplier) - hparams.entropy_weight * entropy, jnp.mean(away)
 
-        def critic_loss(networks: Any, at: jax.Array) -> jax.Array:
-            raw = jax.vmap(critic.apply, in_axes=(0, None), out_axes=-1)(networks, inputs[at])
-            return jnp.mean(jnp.sum((raw[..., 0, :] - target[at]) ** 2, -1))
+        def critic_loss(networks: Any, rows: Batch) -> jax.Array:
+            raw = jax.vmap(critic.apply, in_axes=(0, None), out_axes=-1)(networks, rows.inputs)
+            return jnp.mean(jnp.sum((raw[..., 0, :] - rows.target) ** 2, -1))
 
         def minibatch(carry: Any, at: jax.Array) -> Any:
             actor, critics, stop = carry
+            rows = made.rows(at)
 
             def move(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
-                grads, away = jax.grad(policy_loss, has_aux=True)(actor.params, at)
+                grads, away = jax.grad(policy_loss, has_aux=True)(actor.params, rows)
                 actor = adam_step(actor, limited(grads, hparams.max_gradient), rate)
                 log_std = jnp.minimum(actor.params["log_std"], most_log_std)
                 log_std = jnp.maximum(log_std, jnp.log(hparams.least_std))
@@ -324,35 +366,26 @@ def make_ppo_lagrangian(
             def stay(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
                 return actor, (jnp.zeros(()), jnp.zeros(()))
 
-            actor, made = jax.lax.cond(stop, stay, move, actor)
-            loss, grads = jax.value_and_grad(critic_loss)(critics.params, at)
-            # the critics keep their rate at the start of a run whose policy is cloned already
+            actor, moved = jax.lax.cond(stop, stay, move, actor)
+            loss, grads = jax.value_and_grad(critic_loss)(critics.params, rows)
             critics = adam_step(critics, limited(grads, hparams.max_gradient), rate)
-            return (actor, critics, stop), (*made, loss)
+            return (actor, critics, stop), (*moved, loss)
 
         def epoch(carry: Any, key: jax.Array) -> Any:
-            at = jnp.reshape(jax.random.permutation(key, flat), (config.minibatches, rows))
-            (actor, critics, stop), (away, made, loss) = jax.lax.scan(minibatch, carry, at)
-            away = jnp.sum(away) / jnp.maximum(jnp.sum(made), 1)
+            order = jax.random.permutation(key, config.batch_steps)
+            at = jnp.reshape(order, (config.minibatches, -1))
+            (actor, critics, stop), (away, moved, loss) = jax.lax.scan(minibatch, carry, at)
+            away = jnp.sum(away) / jnp.maximum(jnp.sum(moved), 1)
             stop = stop | (away > hparams.max_divergence)
-            return (actor, critics, stop), (away, jnp.mean(made), jnp.mean(loss))
+            return (actor, critics, stop), (away, jnp.mean(moved), jnp.mean(loss))
 
         keys = jax.random.split(key, config.epochs)
         carry = (learned.policy, learned.critics, critics_only)
-        (actor, critics, _), (away, made, loss) = jax.lax.scan(epoch, carry, keys)
-        learned = dataclasses.replace(
-            learned,
-            policy=actor,
-            critics=critics,
-            inputs=learned.inputs.add(jnp.reshape(steps.observation, (flat, size))),
-            returns=returns,
-        )
-        return learned, {
+        (actor, critics, _), (away, epochs, loss) = jax.lax.scan(epoch, carry, keys)
+        return dataclasses.replace(learned, policy=actor, critics=critics), {
             "loss_critics": jnp.mean(loss),
             "divergence": jnp.max(away),
-            "epochs": jnp.sum(made),
-            "advantage_std": spread[0],
-            "cost_advantage_std": spread[1],
+            "epochs": jnp.sum(epochs),
             "action_std": jnp.mean(jnp.exp(actor.params["log_std"])),
         }
 
@@ -367,7 +400,11 @@ def make_ppo_lagrangian(
                 before.multiplier, cost, hparams.cost_limit, hparams.multiplier_rate, known
             ),
         )
-        learned, metrics = improve(learned, steps, key_improve, hparams, learner.batches)
+        learned, batch, metrics = prepare(learned, steps, hparams)
+        learned, more = improve(learned, batch, key_improve, hparams, learner.batches)
+        seen = jnp.reshape(steps.observation, (config.batch_steps, size))
+        learned = dataclasses.replace(learned, inputs=learned.inputs.add(seen))
+        metrics |= more
         finite = jnp.all(jnp.isfinite(jnp.stack(list(metrics.values()))))
         diverged = learner.diverged | ~finite
         kept = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), learned, before)
@@ -388,7 +425,7 @@ def make_ppo_lagrangian(
         return jax.lax.scan(iterate, learner, None, length=batches)
 
     def clone(learner: PPOLearner) -> tuple[PPOLearner, Metrics]:
-        """The expert demonstrates under noise, as in DART (Laskey et al. 2017); the mean clones it.
+        """The expert demonstrates under noise, as in DART (Laskey et al. 2017), and is cloned.
 
         What is cloned is its action without the noise, which shows it how to get back.
         """
@@ -409,7 +446,6 @@ def make_ppo_lagrangian(
         learner, shown = jax.lax.scan(show, learner, None, length=length)
         observation, action = (jnp.reshape(x, (-1, x.shape[-1])) for x in shown[:2])
         inputs = learner.learned.inputs.add(observation)
-        inputs = dataclasses.replace(learner.learned, inputs=inputs).inputs
         seen = scaled(inputs, observation)
 
         def update(learned: Learned, at: Any) -> tuple[Learned, jax.Array]:
@@ -429,18 +465,7 @@ def make_ppo_lagrangian(
         cloned, losses = jax.lax.scan(update, learner.learned.policy, each)
         start = init_learned(cloned.average)  # PPO's Adam starts anew
         learned = dataclasses.replace(learner.learned, policy=start, inputs=inputs)
-        zero = jnp.zeros(config.worlds)
-        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
-            jax.random.split(key, config.worlds), params
-        )
-        learner = dataclasses.replace(
-            learner,
-            learned=learned,
-            key=key,
-            env_state=env_state,
-            observation=observation,
-            played=Played(zero, zero, zero),
-        )
+        learner = dataclasses.replace(learner, learned=learned, key=key, **start_worlds(key))
         return learner, {
             "clone/loss": losses[-1],
             "clone/success_rate": mean_of_ended(shown[2], shown[3])[0],

@@ -8,7 +8,7 @@ import pytest
 
 import envs
 from envs import pretrained
-from experiments import card, expert
+from experiments import card, expert, figures
 from experiments.cli import main
 from experiments.evaluate import make_world, named_expert, named_policy, summarise_episodes
 from experiments.policy_file import load_policy, save_policy
@@ -61,6 +61,8 @@ def test_a_card_and_a_curve(run, tmp_path):
     assert "train_multiplier" not in rows[0]
     assert rows[-1]["held_out_success_rate"] == made["held_out"]["success_rate"]
     assert (tmp_path / "probe.npz").read_bytes() == (run / "policy.npz").read_bytes()
+    figures.expert_curves(tmp_path, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 5000
 
 
 def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch):
