@@ -79,8 +79,8 @@ def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
     )
     if env == "driving":
         # Many maps: the novice's fifty would be learnt by heart. Discounted by 0.99, twice the
-        # speed is worth more than a good chance to arrive. With a multiplier of 1 from the start the
-        # car leaves the road, which costs once, rather than touch something, which costs per step.
+        # speed is worth more than a good chance to arrive. With a multiplier of 1 from the start,
+        # the car leaves the road, which costs once, to touch nothing, which costs every step.
         config = dataclasses.replace(config, demonstrations=500_000)
         hparams = hparams.replace(
             discount=0.999,
