@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def write_card(run: Path, out: Path) -> None:
         "world": env,
         "policy": f"{env}.npz",
         "command": command_of(config),
-        "date": config["date"],
+        "date": time.strftime("%Y-%m-%d", time.gmtime((run / SUMMARY).stat().st_mtime)),
         "seed": config["seed"],
         "steps": summary["total_steps"],
         "demonstrations": config["config"]["demonstrations"],

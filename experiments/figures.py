@@ -106,20 +106,21 @@ def expert_curves(folder: Path, out: Path) -> None:
             ]
         steps = np.array([row["step"] for row in table]) / 1e6
 
-        def line(axes: Any, column: str, label: str, colour: str, steps=steps, table=table) -> None:
-            axes.plot(steps, [row[column] for row in table], color=colour, label=label)
+        def line(axes: Any, column: str, label: str, style: str, steps=steps, table=table) -> None:
+            axes.plot(steps, [row[column] for row in table], style, label=label)
 
-        line(success, "held_out_success_rate", "held out", "tab:blue")
-        line(success, "train_success_rate", "in training", "tab:orange")
+        line(success, "held_out_success_rate", "held out, without noise", "-")
+        line(success, "train_success_rate", "in training, with noise", ":")
         success.set_ylim(0, 1.03)
         success.set_ylabel(f"{path.stem}\nsuccess")
-        line(cost, "held_out_episodic_cost", "held out", "tab:blue")
-        line(cost, "train_episodic_cost", "in training", "tab:orange")
+        line(cost, "held_out_episodic_cost", "held out", "-")
+        line(cost, "train_episodic_cost", "in training", ":")
         cost.axhline(limit, color="black", linewidth=0.8, linestyle="--", label="limit")
-        cost.set_yscale("symlog", linthresh=1)
+        if max(row["held_out_episodic_cost"] for row in table) > 10:
+            cost.set_yscale("symlog", linthresh=1)
         cost.set_ylim(bottom=0)
         cost.set_ylabel("cost per episode")
-        line(multiplier, "train_multiplier", "multiplier", "tab:green")
+        line(multiplier, "train_multiplier", "multiplier", "-")
         multiplier.set_ylabel("multiplier")
         multiplier.set_ylim(bottom=0)
         for axes in (success, cost, multiplier):

@@ -293,7 +293,6 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
                 "versions": versions(),
                 "device": device(),
                 "revision": revision(),
-                "date": time.strftime("%Y-%m-%d"),
             }
         )
     except ValueError as error:
