@@ -275,6 +275,8 @@ class ExpertTrain:
     """Standard deviation of the actions at the start."""
     least_std: float | None = None
     """Standard deviation of the actions at least."""
+    final_std: float | None = None
+    """Bound on it at the end."""
     success_bonus: float | None = None
     """Reward for solving the task, while training."""
     training_scenarios: int | None = None
