@@ -1,6 +1,7 @@
 """Training experts from the host: run folder, resume, policy files, and the shipped experts."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import envs
 from envs import pretrained
 from experiments import card, expert, figures
-from experiments.cli import main
+from experiments.cli import ExpertTrain, main
 from experiments.evaluate import make_world, named_expert, named_policy, summarise_episodes
 from experiments.policy_file import load_policy, save_policy
 from experiments.runtime import UserError
@@ -111,6 +112,12 @@ def test_a_mistake_is_one_clear_line(words, message, capsys, tmp_path, monkeypat
     told = capsys.readouterr().err.strip()
     assert message in told
     assert len(told.splitlines()) == 1
+
+
+def test_every_setting_has_its_option():
+    options = {field.name for field in dataclasses.fields(ExpertTrain)}
+    for record in (PPOConfig, PPOHParams):
+        assert {field.name for field in dataclasses.fields(record)} <= options
 
 
 def test_other_settings_are_refused(run):
