@@ -254,7 +254,9 @@ class ExpertTrain:
     learning_rate: float | None = None
     """Of Adam; falls linearly to 0."""
     discount: float | None = None
-    """gamma."""
+    """gamma of the reward."""
+    cost_discount: float | None = None
+    """gamma of the cost."""
     smoothing: float | None = None
     """lambda of the generalised advantages."""
     clip: float | None = None

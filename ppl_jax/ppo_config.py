@@ -16,7 +16,9 @@ class PPOHParams:
 
     Attributes:
         learning_rate: Of Adam; it falls linearly to 0 over the run.
-        discount, smoothing: gamma and GAE's lambda, of reward and of cost.
+        discount, cost_discount: gamma of the reward and of the cost. Where a rare episode costs
+            hundreds, a long horizon drowns the small costs that could be avoided.
+        smoothing: GAE's lambda, of both.
         clip: e.
         max_divergence: Mean KL from the policy that played at which a batch's policy updates stop.
         max_gradient: Norm to which gradients are clipped.
@@ -35,6 +37,7 @@ class PPOHParams:
 
     learning_rate: jax.Array | float = 3e-4
     discount: jax.Array | float = 0.99
+    cost_discount: jax.Array | float = 0.99
     smoothing: jax.Array | float = 0.95
     clip: jax.Array | float = 0.2
     max_divergence: jax.Array | float = 0.02
@@ -120,6 +123,6 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
         if not (value > 0 if above else value >= 0) or not np.isfinite(value):
             what = "positive" if above else "a number of 0 or more"
             raise ValueError(f"{name} must be {what}, got {value}")
-    for name in ("discount", "smoothing"):
+    for name in ("discount", "cost_discount", "smoothing"):
         if getattr(hparams, name) > 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")

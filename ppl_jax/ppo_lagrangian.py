@@ -304,7 +304,8 @@ def make_ppo_lagrangian(
         after = values(learned, scaled(learned.inputs, steps.final_observation))
         signal = jnp.stack([steps.reward, steps.cost], -1)
         ends = steps.terminated[..., None], steps.done[..., None]
-        gain = advantages(signal, before, after, *ends, hparams.discount, hparams.smoothing)
+        discount = jnp.stack([hparams.discount, hparams.cost_discount])
+        gain = advantages(signal, before, after, *ends, discount, hparams.smoothing)
         inputs, action, gain, target = (
             jnp.reshape(x, (config.batch_steps, -1))
             for x in (inputs, steps.action, gain, gain + before)

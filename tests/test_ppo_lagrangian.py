@@ -165,10 +165,10 @@ def test_log_density():
 
 
 def test_values_of_reward_and_cost():
-    made, learner, _ = train(TwoSteps, discount=0.8)
+    made, learner, _ = train(TwoSteps, discount=0.8, cost_discount=0.5)
     values = made.critics(learner, jnp.array([[0.0, 1.0], [1.0, 1.0]]))
     np.testing.assert_allclose(values[:, 0], [0.8, 1.0], atol=0.06)
-    np.testing.assert_allclose(values[:, 1], [2.4, 3.0], atol=0.18)
+    np.testing.assert_allclose(values[:, 1], [1.5, 3.0], atol=0.18)
 
 
 def test_a_time_limit_is_no_end():
