@@ -97,7 +97,7 @@ def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
         config = dataclasses.replace(config, total_steps=10_000_000)
         return config, hparams.replace(success_bonus=50.0), 0
     if env == "nut_assembly":
-        config = dataclasses.replace(config, total_steps=1_500_000)
+        config = dataclasses.replace(config, total_steps=1_000_000)
         return config, hparams.replace(success_bonus=100.0), 0
     return PPOConfig(), PPOHParams(), 0
 
