@@ -269,6 +269,8 @@ class ExpertTrain:
     """Weight of the policy's entropy."""
     cost_limit: float | None = None
     """Mean cost per episode that is allowed."""
+    cost_ends: float | None = None
+    """1 where nothing is worth anything after a step that costs, 0 otherwise."""
     initial_multiplier: float | None = None
     """Of the cost, at the start."""
     multiplier_rate: float | None = None

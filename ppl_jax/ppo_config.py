@@ -24,6 +24,10 @@ class PPOHParams:
         max_gradient: Norm to which gradients are clipped.
         entropy_weight: Of the policy's entropy.
         cost_limit: d, mean cost per episode.
+        cost_ends: 1 where nothing is worth anything after a step that costs: for its advantages an
+            episode ends there (the early-terminated problem of Sun et al. 2021, "Safe Exploration
+            by Solving Early Terminated MDP"), though the world goes on. Then no kind of failure,
+            such as leaving the road, is a way out of a longer one. 0 leaves it as it is.
         initial_multiplier, multiplier_rate: lambda at the start, and Adam's rate for p.
         initial_std, least_std: Of the actions, at the start and at least.
         final_std: Bound on it at the end; from `initial_std` it moves there geometrically. Noise
@@ -44,6 +48,7 @@ class PPOHParams:
     max_gradient: jax.Array | float = 0.5
     entropy_weight: jax.Array | float = 0.0
     cost_limit: jax.Array | float = 1.0
+    cost_ends: jax.Array | float = 0.0
     initial_multiplier: jax.Array | float = 1.0
     multiplier_rate: jax.Array | float = 0.01
     initial_std: jax.Array | float = 0.5
@@ -123,6 +128,6 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
         if not (value > 0 if above else value >= 0) or not np.isfinite(value):
             what = "positive" if above else "a number of 0 or more"
             raise ValueError(f"{name} must be {what}, got {value}")
-    for name in ("discount", "cost_discount", "smoothing"):
+    for name in ("discount", "cost_discount", "smoothing", "cost_ends"):
         if getattr(hparams, name) > 1:
             raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")

@@ -303,7 +303,8 @@ def make_ppo_lagrangian(
         before = values(learned, inputs)
         after = values(learned, scaled(learned.inputs, steps.final_observation))
         signal = jnp.stack([steps.reward, steps.cost], -1)
-        ends = steps.terminated[..., None], steps.done[..., None]
+        over = hparams.cost_ends * steps.cost > 0
+        ends = (steps.terminated | over)[..., None], (steps.done | over)[..., None]
         discount = jnp.stack([hparams.discount, hparams.cost_discount])
         gain = advantages(signal, before, after, *ends, discount, hparams.smoothing)
         inputs, action, gain, target = (
