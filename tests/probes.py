@@ -216,6 +216,16 @@ class TwoSteps(Goal):
         )
 
 
+class Toll(TwoSteps):
+    """The same, but it is the first of the two steps that costs."""
+
+    name = "toll"
+
+    def transition(self, key, state, action, params):
+        state, outcome = super().transition(key, state, action, params)
+        return state, outcome.replace(cost=1.0 * (state.time == 1))
+
+
 class Endless(TwoSteps):
     """Every step pays 1, time alone ends it, all looks the same: V = 1 / (1 - gamma)."""
 

@@ -15,7 +15,7 @@ from ppl_jax.experts import SavedPolicy, act, log_density
 from ppl_jax.policy_gradient import advantages, clipped_loss, gaussian_divergence
 from ppl_jax.ppo_config import PPOConfig, PPOHParams
 from ppl_jax.ppo_lagrangian import make_ppo_lagrangian
-from tests.probes import Aim, Endless, Goal, Probe, Spend, TwoSteps
+from tests.probes import Aim, Endless, Goal, Probe, Spend, Toll, TwoSteps
 
 RNG = np.random.default_rng(2)
 TINY = PPOConfig(
@@ -169,6 +169,13 @@ def test_values_of_reward_and_cost():
     values = made.critics(learner, jnp.array([[0.0, 1.0], [1.0, 1.0]]))
     np.testing.assert_allclose(values[:, 0], [0.8, 1.0], atol=0.06)
     np.testing.assert_allclose(values[:, 1], [1.5, 3.0], atol=0.18)
+
+
+@pytest.mark.parametrize(("ends", "value"), [(0.0, 0.8), (1.0, 0.0)])
+def test_a_cost_may_end_what_is_worth_anything(ends, value):
+    made, learner, _ = train(Toll, discount=0.8, cost_ends=ends)
+    values = made.critics(learner, jnp.array([[0.0, 1.0], [1.0, 1.0]]))
+    np.testing.assert_allclose(values[:, 0], [value, 1.0], atol=0.06)
 
 
 def test_a_time_limit_is_no_end():
