@@ -150,8 +150,8 @@ class Batch:
 
     def rows(self, at: jax.Array) -> Batch:
         """The steps of these numbers."""
-        chosen = jax.tree.map(lambda x: x[at], self.replace(log_std=None))
-        return chosen.replace(log_std=self.log_std)
+        chosen = jax.tree.map(lambda x: x[at], dataclasses.replace(self, log_std=None))
+        return dataclasses.replace(chosen, log_std=self.log_std)
 
 
 class PPOFunctions(NamedTuple):
