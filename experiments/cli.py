@@ -244,7 +244,9 @@ class ExpertTrain:
     scaling: Literal["running", "world"] | None = None
     """Inputs are scaled by running statistics, or by the world's constants."""
     demonstrations: int | None = None
-    """Steps of the scripted expert, under noise, that the policy clones first."""
+    """Steps that the scripted expert labels, under noise, and that the policy clones first."""
+    demonstration_rounds: int | None = None
+    """Rounds of these: the expert plays the first, the clone the others."""
     cloning_updates: int | None = None
     """Updates of that."""
     demonstration_noise: float | None = None

@@ -151,7 +151,9 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     config, folder = settings.config, RunFolder(out)
     env = build(settings)
     try:
-        functions = make_ppo_lagrangian(env, config, expert=getattr(env, "scripted_expert", None))
+        scripted = getattr(env, "scripted_expert", None)
+        shown_by = getattr(env, "demonstrator", scripted)
+        functions = make_ppo_lagrangian(env, config, expert=shown_by)
     except ValueError as error:
         raise UserError(str(error)) from error
     open_folder(folder, settings.as_json(), resume)

@@ -70,8 +70,11 @@ class PPOConfig:
         hidden: Widths of the hidden layers of policy and critics.
         scaling: Inputs are centred and scaled by running statistics of what was seen, or by the
             world's constants.
-        demonstrations: Steps of a demonstrating expert, under noise, that the policy clones first.
-        cloning_updates: Updates of that.
+        demonstrations: Steps that an expert labels with what it would do, under noise, and that
+            the policy clones first.
+        demonstration_rounds: Into which these are split: the expert plays the first, the clone the
+            others.
+        cloning_updates: Updates of that, over all rounds.
         critic_batches: Batches at the start in which only the critics learn.
     """
 
@@ -83,6 +86,7 @@ class PPOConfig:
     hidden: tuple[int, ...] = (256, 256)
     scaling: Literal["running", "world"] = "running"
     demonstrations: int = 0
+    demonstration_rounds: int = 1
     cloning_updates: int = 20_000
     critic_batches: int = 0
 
@@ -103,7 +107,14 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
     Raises:
         ValueError: One line naming field, value and what is allowed.
     """
-    for field in ("total_steps", "worlds", "rollout_steps", "epochs", "minibatches"):
+    for field in (
+        "total_steps",
+        "worlds",
+        "rollout_steps",
+        "epochs",
+        "minibatches",
+        "demonstration_rounds",
+    ):
         if getattr(config, field) < 1:
             raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")
     for field in ("demonstrations", "cloning_updates", "critic_batches"):

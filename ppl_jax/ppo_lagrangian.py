@@ -160,7 +160,8 @@ class PPOFunctions(NamedTuple):
     Attributes:
         init: `init(key, hparams) -> PPOLearner`.
         clone: `clone(learner) -> (learner, Metrics)`: demonstrations, and the policy cloned from
-            them; where the settings name any.
+            them, where the settings name any; metrics say how often who played succeeded in the
+            first round and in the last.
         run: `run(learner, batches) -> (learner, Metrics)` for a static number of batches; metrics
             carry a leading [batches] axis.
         policy: `policy(learner) -> SavedPolicy` with its `log_std`.
@@ -427,50 +428,79 @@ def make_ppo_lagrangian(
         return jax.lax.scan(iterate, learner, None, length=batches)
 
     def clone(learner: PPOLearner) -> tuple[PPOLearner, Metrics]:
-        """The expert demonstrates under noise, as in DART (Laskey et al. 2017), and is cloned.
+        """The expert shows under noise what to do, as in DART (Laskey et al. 2017), and is cloned.
 
-        What is cloned is its action without the noise, which shows it how to get back.
+        What is cloned is its action without the noise, which shows it how to get back. In every
+        round after the first the clone plays, under the same noise, and the expert says what it
+        would have done; the clone learns from all rounds so far (DAgger; Ross et al. 2011).
         """
         assert expert is not None  # see `make_ppo_lagrangian`
         demonstrate = jax.vmap(expert, in_axes=(0, 0, 0, None))
-        length = -(-config.demonstrations // config.worlds)
+        rounds = config.demonstration_rounds
+        length = -(-config.demonstrations // (config.worlds * rounds))
+        updates = config.cloning_updates // rounds
 
-        def show(learner: PPOLearner, _: None) -> Any:
-            key, key_expert, key_noise, key_step = jax.random.split(learner.key, 4)
-            observation = learner.observation
-            keys = jax.random.split(key_expert, config.worlds)
-            action = demonstrate(keys, learner.env_state, observation, params)
-            noise = learner.hparams.demonstration_noise * jax.random.normal(key_noise, action.shape)
+        def one_round(carry: Any, number: jax.Array) -> Any:
+            learner, cloned, inputs, kept = carry
+
+            def show(learner: PPOLearner, _: None) -> Any:
+                key, key_expert, key_noise, key_step = jax.random.split(learner.key, 4)
+                observation = learner.observation
+                keys = jax.random.split(key_expert, config.worlds)
+                shown = demonstrate(keys, learner.env_state, observation, params)
+                own = policy.apply(cloned.average["mean"], scaled(inputs, observation))
+                action = jnp.where(number == 0, shown, own)
+                noise = learner.hparams.demonstration_noise * jax.random.normal(
+                    key_noise, action.shape
+                )
+                learner = dataclasses.replace(learner, key=key)
+                learner, row = step_worlds(key_step, learner, action + noise)
+                return learner, (observation, shown, row[3].success, row[2])
+
+            learner, (*pairs, success, done) = jax.lax.scan(show, learner, None, length=length)
+            inputs = inputs.add(jnp.reshape(pairs[0], (-1, size)))
+            kept = [
+                jax.lax.dynamic_update_slice(to, jnp.reshape(x, (-1, x.shape[-1])), (at, 0))
+                for to, x, at in zip(
+                    kept, pairs, 2 * [number * length * config.worlds], strict=True
+                )
+            ]
+            count = (number + 1) * length * config.worlds
+
+            def update(learned: Learned, at: Any) -> tuple[Learned, jax.Array]:
+                key, progress = at
+                chosen = jax.random.randint(key, (CLONING_BATCH,), 0, count)
+                seen, action = scaled(inputs, kept[0][chosen]), kept[1][chosen]
+
+                def loss(network: Any) -> jax.Array:
+                    mean = policy.apply(network["mean"], seen)
+                    return -jnp.mean(log_likelihood(mean, action, "laplace"))
+
+                value, grads = jax.value_and_grad(loss)(learned.params)
+                return adam_step(learned, grads, CLONING_RATE * (1.0 - progress)), value
+
+            key, key_updates = jax.random.split(learner.key)
             learner = dataclasses.replace(learner, key=key)
-            learner, row = step_worlds(key_step, learner, action + noise)
-            return learner, (observation, action, row[3].success, row[2])
+            progress = (number + jnp.arange(updates) / max(updates, 1)) / rounds
+            each = (jax.random.split(key_updates, updates), progress)
+            cloned, losses = jax.lax.scan(update, cloned, each)
+            return (learner, cloned, inputs, kept), {
+                "loss": jnp.sum(losses) / max(updates, 1),
+                "success_rate": mean_of_ended(success, done)[0],
+            }
 
-        learner, shown = jax.lax.scan(show, learner, None, length=length)
-        observation, action = (jnp.reshape(x, (-1, x.shape[-1])) for x in shown[:2])
-        inputs = learner.learned.inputs.add(observation)
-        seen = scaled(inputs, observation)
-
-        def update(learned: Learned, at: Any) -> tuple[Learned, jax.Array]:
-            key, progress = at
-            chosen = jax.random.randint(key, (CLONING_BATCH,), 0, seen.shape[0])
-
-            def loss(network: Any) -> jax.Array:
-                mean = policy.apply(network["mean"], seen[chosen])
-                return -jnp.mean(log_likelihood(mean, action[chosen], "laplace"))
-
-            value, grads = jax.value_and_grad(loss)(learned.params)
-            return adam_step(learned, grads, CLONING_RATE * (1.0 - progress)), value
-
-        key, key_updates = jax.random.split(learner.key)
-        updates = config.cloning_updates
-        each = (jax.random.split(key_updates, updates), jnp.arange(updates) / max(updates, 1))
-        cloned, losses = jax.lax.scan(update, learner.learned.policy, each)
+        total = rounds * length * config.worlds
+        kept = [jnp.zeros((total, width)) for width in (size, spec.action_size)]
+        carry = (learner, learner.learned.policy, learner.learned.inputs, kept)
+        carry, metrics = jax.lax.scan(one_round, carry, jnp.arange(rounds))
+        learner, cloned, inputs, _ = carry
         start = init_learned(cloned.average)  # PPO's Adam starts anew
         learned = dataclasses.replace(learner.learned, policy=start, inputs=inputs)
-        learner = dataclasses.replace(learner, learned=learned, key=key, **start_worlds(key))
+        learner = dataclasses.replace(learner, learned=learned, **start_worlds(learner.key))
         return learner, {
-            "clone/loss": losses[-1],
-            "clone/success_rate": mean_of_ended(shown[2], shown[3])[0],
+            "clone/loss": metrics["loss"][-1],
+            "clone/success_rate": metrics["success_rate"][0],
+            "clone/last_success_rate": metrics["success_rate"][-1],
         }
 
     def saved(learner: PPOLearner) -> SavedPolicy:

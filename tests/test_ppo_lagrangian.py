@@ -224,6 +224,18 @@ def test_cloning_demonstrations_comes_first():
     assert int(learner.batches) == 0
 
 
+def test_in_later_rounds_the_clone_plays():
+    config = dataclasses.replace(TINY, demonstrations=2560, demonstration_rounds=4, scaling="world")
+    for updates, success in ((0, 0.0), (400, 1.0)):
+        made, _, init = functions(Probe, dataclasses.replace(config, cloning_updates=updates))
+        learner, metrics = jax.jit(made.clone)(
+            init(jax.random.key(0), PPOHParams(demonstration_noise=0.05))
+        )
+        assert float(metrics["clone/success_rate"]) == 1.0
+        assert float(metrics["clone/last_success_rate"]) == success
+        assert float(jnp.mean(score(Probe, made, learner).success)) == success
+
+
 # --- properties ---
 
 

@@ -293,6 +293,13 @@ class Driving(Environment):
 
         return scripted_expert
 
+    @property
+    def demonstrator(self) -> Expert:
+        """The expert that a neural one learns from first."""
+        from envs.driving.expert import cautious_expert
+
+        return cautious_expert
+
     def scenario_numbers(self, params: DrivingParams) -> jax.Array:
         """Numbers of the pool's scenarios, [S]."""
         return params.scenarios.number

@@ -19,6 +19,7 @@ from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
 
 CRUISE_SPEED = 12.0  # m/s
+CAUTIOUS_SPEED = 9.0  # m/s: a third of the cost, and still every scenario solved
 LATERAL_ACCELERATION = 3.5  # m/s^2, allowed in bends
 COMFORT_BRAKING = 3.0  # m/s^2, when slowing for a bend or an object
 CREEP_SPEED = 1.5  # m/s, to steer round something from standstill
@@ -87,6 +88,30 @@ def scripted_expert(
         params: Of the world.
     """
     del key, observation
+    return drive(state, params, CRUISE_SPEED, tracks_wrecks=False)
+
+
+def cautious_expert(
+    key: jax.Array, state: DrivingState, observation: jax.Array, params: DrivingParams
+) -> jax.Array:
+    """`scripted_expert`, slower and minding wrecks that were pushed away.
+
+    What a neural expert learns from first.
+    """
+    del key, observation
+    return drive(state, params, CAUTIOUS_SPEED, tracks_wrecks=True)
+
+
+def drive(
+    state: DrivingState, params: DrivingParams, cruise_speed: float, tracks_wrecks: bool
+) -> jax.Array:
+    """The experts' action, [2], at no more than `cruise_speed` m/s.
+
+    Args:
+        state, params: Of the world.
+        cruise_speed: m/s.
+        tracks_wrecks: Wrecks are where they were pushed to; else forgotten once they lie still.
+    """
     scenario = take(params.scenarios, state.scenario)
     lanes, ego = scenario.lanes, state.ego
     road = state.navigation.road
@@ -97,7 +122,7 @@ def scripted_expert(
     here = lateral / width  # lane number as a real number
     ego_along = _along_route(scenario, road, long)
 
-    things = _things(scenario, state, ego_along)
+    things = _things(scenario, state, ego_along, tracks_wrecks)
     target = _choose_lane(scenario, road, here, things, speed, width)
 
     # steering: pure pursuit of the target lane's centre line
@@ -119,7 +144,7 @@ def scripted_expert(
     )
     bend_speed = jnp.sqrt(LATERAL_ACCELERATION / jnp.maximum(jnp.abs(curvature), 1e-3))
     allowed = jnp.sqrt(bend_speed**2 + 2 * COMFORT_BRAKING * jnp.maximum(distances - 3.0, 0.0))
-    wish = jnp.minimum(jnp.min(allowed), CRUISE_SPEED)
+    wish = jnp.minimum(jnp.min(allowed), cruise_speed)
     gap = things.ahead - things.half_length - _HALF_LENGTH
     reach_side = things.half_width + _HALF_WIDTH + _SIDE_MARGIN
     from_here = jnp.abs(things.lateral - lateral)
@@ -168,7 +193,9 @@ def _crossing_limit(scenario: Scenario, state: DrivingState) -> jax.Array:
     return jnp.min(jnp.where(in_front, allowed, jnp.inf))
 
 
-def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Things:
+def _things(
+    scenario: Scenario, state: DrivingState, ego_along: jax.Array, tracks_wrecks: bool
+) -> Things:
     lanes, objects, traffic = scenario.lanes, scenario.objects, state.traffic
     plan = scenario.traffic
     leg = jnp.take_along_axis(plan.way_first, traffic.leg[:, None], 1)[:, 0]
@@ -181,17 +208,25 @@ def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Th
     share = traffic.long / lanes.length[own] * lanes.length[reference]
     offset = traffic.number * lanes.width[own] + traffic.lateral
     half = jnp.concatenate([plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)])
+    strayed = jnp.sum((state.box_pose - objects.box_pose)[:, :2] ** 2, -1) > 0.25
+    vehicles, boxes = traffic.status.shape[0], strayed.shape[0]
+    along, across = objects.along, objects.across
+    if tracks_wrecks:
+        road = scenario.route_lane[jnp.maximum(route[vehicles : vehicles + boxes], 0)]
+        place = lane_coordinates(take(lanes, road), state.box_pose[:, :2])
+        along, across = (
+            x.at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
+            for x, now in zip((along, across), place, strict=True)
+        )
+        strayed = jnp.zeros_like(strayed)
     ahead = (
-        _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, objects.along]))
-        - ego_along
+        _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, along])) - ego_along
     )
     # a wreck that was pushed away is not where the lane says; `_crossing_limit` minds it
-    strayed = jnp.sum((state.box_pose - objects.box_pose)[:, :2] ** 2, -1) > 0.25
-    vehicles, circles = traffic.status.shape[0], objects.circle.shape[0]
-    strayed = jnp.pad(strayed, (vehicles, circles))
+    strayed = jnp.pad(strayed, (vehicles, objects.circle.shape[0]))
     return Things(
         ahead=jnp.where((route >= 0) & ~strayed, ahead, jnp.inf),
-        lateral=jnp.concatenate([offset, objects.across]),
+        lateral=jnp.concatenate([offset, across]),
         half_length=half[:, 0],
         half_width=half[:, 1],
         speed=jnp.concatenate([traffic.speed, jnp.zeros_like(objects.long)]),
