@@ -6,12 +6,13 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import tyro
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from envs.compiler import set_xla_flags
+from experiments.engines import SERVE
 from experiments.runtime import UserError
 
 
@@ -251,6 +252,10 @@ class ExpertTrain:
     """Updates of that."""
     demonstration_noise: float | None = None
     """Standard deviation of that noise."""
+    guided: bool | None = None
+    """The expert also says at every step of the training what it would do."""
+    guidance_weight: float | None = None
+    """Of the distance from that."""
     critic_batches: int | None = None
     """Batches at the start in which only the critics learn."""
     learning_rate: float | None = None
@@ -323,6 +328,94 @@ class ExpertCard:
     """Folder to write to."""
 
 
+_NO_AXES = (
+    "env",
+    "algorithm",
+    "seed",
+    "preset",
+    "total_steps",
+    "evaluate_every",
+    "evaluate_on",
+    "expert",
+    "reference_policy",
+    "scenarios",
+    "held_out_scenarios",
+    "out",
+    "resume",
+)
+
+
+def _axes() -> type:
+    """A dataclass with several values of every setting of `Train` that a sweep may vary."""
+    hints = get_type_hints(Train)
+    fields = []
+    for field in dataclasses.fields(Train):
+        if field.name not in _NO_AXES:
+            kind = next(part for part in get_args(hints[field.name]) if part is not type(None))
+            told = tyro.conf.arg(help=f"Values of {field.name}; see `ppl train --help`.")
+            fields.append((field.name, Annotated[tuple[kind, ...], told], ()))
+    return dataclasses.make_dataclass("Axes", fields)
+
+
+Axes = _axes()
+
+
+@dataclasses.dataclass
+class Sweep:
+    """Train every combination of settings with every seed; resumes.
+
+    Give several values of any setting, or a study that names them.
+    """
+
+    envs: Positional[tuple[str, ...]]
+    """Worlds: driving, table_wiping, nut_assembly."""
+    study: (
+        Literal["horizon", "horizon_beta", "prediction_noise", "expert_noise", "predictor"] | None
+    ) = None
+    """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
+    Values given replace the study's."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: ppl, or the study's)."""
+    seeds: int = 5
+    """Seeds 0, 1, ..., the same everywhere."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    expert: str = "scripted"
+    """scripted, neural (the shipped one), or a policy file or run folder."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on."""
+    axes: OmitArgPrefixes[Axes] = dataclasses.field(default_factory=Axes)
+    """Values of the settings."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
+    address: str | None = None
+    """Engine ray: of a running cluster (default: one on this machine)."""
+    processes: int = 2
+    """Engine local, on a CPU: runs at the same time; as many as there are cores get one each."""
+    batch: int | None = None
+    """Runs per program (default: one on a CPU, on accelerators what memory holds)."""
+    dry_run: bool = False
+    """Say how much work it is, and stop."""
+    out: Path = Path("sweep")
+    """Folder of the result files; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Robustness(Sweep):
+    """Train under noise on predicted states (or on the expert's actions); resumes."""
+
+    study: Literal["prediction_noise", "expert_noise"] = "prediction_noise"
+    """Whose noise."""
+    out: Path = Path("robustness")
+    """Folder of the result files; finished runs in it are kept."""
+
+
 @dataclasses.dataclass
 class Expert:
     """Train, evaluate or describe an expert."""
@@ -389,6 +482,8 @@ Command = (
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Ablation, subcommand("ablation")]
     | Annotated[Tune, subcommand("tune")]
+    | Annotated[Sweep, subcommand("sweep")]
+    | Annotated[Robustness, subcommand("robustness")]
     | Annotated[Expert, subcommand("expert")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
@@ -508,6 +603,14 @@ def _tune(command: Tune) -> None:
     tune(command)
 
 
+def _sweep(command: Sweep) -> None:
+    from experiments.runtime import start_jax
+    from experiments.sweep import sweep
+
+    start_jax()
+    sweep(command)
+
+
 def _expert(command: Expert) -> None:
     if isinstance(command.command, ExpertTrain):
         _expert_train(command.command)
@@ -608,6 +711,8 @@ _ACTIONS = {
     Compare: _compare,
     Ablation: _ablation,
     Tune: _tune,
+    Sweep: _sweep,
+    Robustness: _sweep,
     Expert: _expert,
     Export: _export,
     Render: _render,
@@ -619,6 +724,10 @@ _ACTIONS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
+    if (sys.argv[1:] if argv is None else argv) == [SERVE]:
+        from experiments.worker import serve
+
+        return serve()
     command = tyro.cli(Command, prog="ppl", args=argv, description=__doc__)
     try:
         _ACTIONS[type(command)](command)

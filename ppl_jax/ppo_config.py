@@ -37,6 +37,7 @@ class PPOHParams:
             solving it ends the episode and a state shortly before pays every step, return alone
             would have the policy loiter there.
         demonstration_noise: Standard deviation of the noise under which the expert demonstrates.
+        guidance_weight: Of the distance from the expert's action, where the policy is guided.
     """
 
     learning_rate: jax.Array | float = 3e-4
@@ -56,6 +57,7 @@ class PPOHParams:
     final_std: jax.Array | float = 1.0
     success_bonus: jax.Array | float = 0.0
     demonstration_noise: jax.Array | float = 0.3
+    guidance_weight: jax.Array | float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +77,7 @@ class PPOConfig:
         demonstration_rounds: Into which these are split: the expert plays the first, the clone the
             others.
         cloning_updates: Updates of that, over all rounds.
+        guided: The expert also says at every step of the training what it would do.
         critic_batches: Batches at the start in which only the critics learn.
     """
 
@@ -88,6 +91,7 @@ class PPOConfig:
     demonstrations: int = 0
     demonstration_rounds: int = 1
     cloning_updates: int = 20_000
+    guided: bool = False
     critic_batches: int = 0
 
     @property

@@ -14,7 +14,13 @@ Learning"):
 As A is divided by its standard deviation s, the multiplier in units of the reward is lambda s
 (`train/multiplier` times `train/advantage_std`). Beside the published recipe: the cost's ratio is
 clipped too; the policy's updates of a batch stop at the first epoch whose divergence from the
-policy that played exceeds `max_divergence`; where no episode ended, the multiplier stays.
+policy that played exceeds `max_divergence`; where no episode ended, the multiplier stays; a policy
+that is `guided` also keeps to what an expert would do where it went,
+
+    + w E[ |mean - expert's action| ],    w: `guidance_weight`
+
+as the demonstration-augmented gradient of Rajeswaran et al. (2018, "Learning Complex Dexterous
+Manipulation") keeps to demonstrations.
 
 The policy is a Gaussian around tanh of a network of the scaled observation, clipped to the action
 box where it acts.
@@ -123,6 +129,7 @@ class Rollout:
     terminated: jax.Array
     done: jax.Array
     success: jax.Array
+    advice: jax.Array  # what the expert would have done; the action itself where nobody is asked
     ended: Played  # of the episode, up to and with this step
 
 
@@ -132,7 +139,7 @@ class Batch:
 
     Attributes:
         inputs: [N, O] scaled observations.
-        action: [N, A].
+        action, advice: [N, A].
         mean, log_std: [N, A], [A] of the policy that played.
         log_prob: [N] that it gave the action.
         gain, cost_gain: [N] A standardised, A_C centred.
@@ -141,6 +148,7 @@ class Batch:
 
     inputs: jax.Array
     action: jax.Array
+    advice: jax.Array
     mean: jax.Array
     log_std: jax.Array
     log_prob: jax.Array
@@ -189,8 +197,9 @@ def make_ppo_lagrangian(
     Raises:
         ValueError: If demonstrations are asked for and there is no expert.
     """
-    if config.demonstrations and expert is None:
-        raise ValueError(f"demonstrations: {env.name} has no expert to give them")
+    for field in ("demonstrations", "guided"):
+        if getattr(config, field) and expert is None:
+            raise ValueError(f"{field}: {env.name} has no expert to learn from")
     params = env.default_params if env_params is None else env_params
     spec = env.spec
     size = spec.observation_size
@@ -271,12 +280,18 @@ def make_ppo_lagrangian(
         )
         return learner, (reward, terminated, done, info, played)
 
+    def advise(key: jax.Array, env_state: PyTree, observation: jax.Array) -> jax.Array:
+        """The expert's action in every world, [W, A]."""
+        assert expert is not None  # see `make_ppo_lagrangian`
+        keys = jax.random.split(key, config.worlds)
+        return jax.vmap(expert, in_axes=(0, 0, 0, None))(keys, env_state, observation, params)
+
     def rollout(learner: PPOLearner) -> tuple[PPOLearner, Rollout]:
         network, inputs = learner.learned.policy.params, learner.learned.inputs
 
         def step(learner: PPOLearner, _: None) -> tuple[PPOLearner, Rollout]:
             key, key_act, key_step = jax.random.split(learner.key, 3)
-            observation = learner.observation
+            observation, before = learner.observation, learner.env_state
             mean = policy.apply(network["mean"], scaled(inputs, observation))
             noise = jax.random.normal(key_act, mean.shape)
             action = mean + jnp.exp(network["log_std"]) * noise
@@ -291,6 +306,7 @@ def make_ppo_lagrangian(
                 terminated,
                 done,
                 info.success,
+                advise(key_act, before, observation) if config.guided else action,
                 played,
             )
 
@@ -308,9 +324,9 @@ def make_ppo_lagrangian(
         ends = (steps.terminated | over)[..., None], (steps.done | over)[..., None]
         discount = jnp.stack([hparams.discount, hparams.cost_discount])
         gain = advantages(signal, before, after, *ends, discount, hparams.smoothing)
-        inputs, action, gain, target = (
+        inputs, action, advice, gain, target = (
             jnp.reshape(x, (config.batch_steps, -1))
-            for x in (inputs, steps.action, gain, gain + before)
+            for x in (inputs, steps.action, steps.advice, gain, gain + before)
         )
         returns = learned.returns.add(target**2)
         gain, spread = gain - jnp.mean(gain, 0), jnp.std(gain, 0)
@@ -319,6 +335,7 @@ def make_ppo_lagrangian(
         batch = Batch(
             inputs=inputs,
             action=action,
+            advice=advice,
             mean=mean,
             log_std=log_std,
             log_prob=gaussian_log_prob(mean, log_std, action),
@@ -348,7 +365,11 @@ def make_ppo_lagrangian(
             cost = clipped_loss(new, rows.log_prob, -rows.cost_gain, hparams.clip)
             loss, entropy = loss + multiplier * cost, jnp.sum(log_std)
             away = gaussian_divergence(rows.mean, rows.log_std, mean, log_std)
-            return loss / (1 + multiplier) - hparams.entropy_weight * entropy, jnp.mean(away)
+            total = loss / (1 + multiplier) - hparams.entropy_weight * entropy
+            if config.guided:
+                likely = log_likelihood(mean, rows.advice, "laplace")
+                total = total - hparams.guidance_weight * jnp.mean(likely)
+            return total, jnp.mean(away)
 
         def critic_loss(networks: Any, rows: Batch) -> jax.Array:
             raw = jax.vmap(critic.apply, in_axes=(0, None), out_axes=-1)(networks, rows.inputs)
@@ -434,8 +455,6 @@ def make_ppo_lagrangian(
         round after the first the clone plays, under the same noise, and the expert says what it
         would have done; the clone learns from all rounds so far (DAgger; Ross et al. 2011).
         """
-        assert expert is not None  # see `make_ppo_lagrangian`
-        demonstrate = jax.vmap(expert, in_axes=(0, 0, 0, None))
         rounds = config.demonstration_rounds
         length = -(-config.demonstrations // (config.worlds * rounds))
         updates = config.cloning_updates // rounds
@@ -446,8 +465,7 @@ def make_ppo_lagrangian(
             def show(learner: PPOLearner, _: None) -> Any:
                 key, key_expert, key_noise, key_step = jax.random.split(learner.key, 4)
                 observation = learner.observation
-                keys = jax.random.split(key_expert, config.worlds)
-                shown = demonstrate(keys, learner.env_state, observation, params)
+                shown = advise(key_expert, learner.env_state, observation)
                 own = policy.apply(cloned.average["mean"], scaled(inputs, observation))
                 action = jnp.where(number == 0, shown, own)
                 noise = learner.hparams.demonstration_noise * jax.random.normal(

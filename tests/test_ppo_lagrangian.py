@@ -236,6 +236,17 @@ def test_in_later_rounds_the_clone_plays():
         assert float(jnp.mean(score(Probe, made, learner).success)) == success
 
 
+@pytest.mark.parametrize(("weight", "reached"), [(0.0, 1.0), (10.0, -0.5)])
+def test_a_guided_policy_keeps_to_the_expert(weight, reached):
+    config = dataclasses.replace(TINY, guided=True)
+    made = make_ppo_lagrangian(Spend(), config, expert=lambda *_: jnp.array([-0.5]))
+    hparams = PPOHParams(guidance_weight=weight, initial_multiplier=1e-3, multiplier_rate=0.0)
+    learner = jax.jit(made.init)(jax.random.key(0), hparams.replace(**QUICK))
+    learner, _ = jax.jit(made.run, static_argnums=1)(learner, 200)
+    mean = act(made.policy(learner), jnp.array([0.0, 1.0]))[0]
+    assert float(mean) == pytest.approx(reached, abs=0.1)
+
+
 # --- properties ---
 
 

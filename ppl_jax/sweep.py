@@ -1,0 +1,133 @@
+"""Many runs as one program: a run with its evaluations as one pure function, and a batch of them.
+
+A core is as fast with one run as with many, so on a CPU a batch is one run after another; an
+accelerator steps them side by side, split over all devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from ppl_jax import experts
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.evaluation import Episodes, make_evaluate
+from ppl_jax.experts import SavedPolicy
+from ppl_jax.training import Counters, Learner, TrainFunctions, phases
+from ppl_jax.types import Env, PyTree
+
+
+class Curve(NamedTuple):
+    """What a run leaves: one entry per evaluation, [P].
+
+    Attributes:
+        episodes: `Episodes` of every held-out scenario, [P, S].
+        counters: `Counters` up to the evaluation, [P].
+        diverged: A loss was not finite by then, [P].
+    """
+
+    episodes: Episodes
+    counters: Counters
+    diverged: jax.Array
+
+
+Lane = Callable[[jax.Array, HParams, PyTree], Curve]
+"""`lane(key, hparams, held_out_params) -> Curve`."""
+
+
+def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
+    """Environment steps at which a run is evaluated: every so many, and at its end."""
+    interact = config.total_steps - config.demonstrations
+    if not interact:
+        return [config.total_steps]
+    steps = [config.demonstrations + n for n in range(every, interact + 1, every)]
+    return steps if interact % every == 0 else [*steps, config.total_steps]
+
+
+def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> Lane:
+    """One whole run as a function: `Curve` at `evaluation_steps(config, every)`.
+
+    It trains what `ppl train` trains, number for number, but holds the evaluations in the
+    program.
+
+    Args:
+        env: The world; its held-out parameters are an argument of the lane, not a constant.
+        functions: Of the method (`ppl_jax.training.make_train`).
+        config: Static settings.
+        every: Steps between evaluations; a multiple of the decision interval and of the method's
+            rounds.
+    """
+    interval = config.decision_interval
+
+    def look(learner: Learner, held_out: PyTree) -> Curve:
+        layers = functions.algorithm.policy(learner.algorithm)
+        mean, scale = env.spec.observation_mean, env.spec.observation_scale
+        policy = SavedPolicy(layers, "relu", "tanh", mean, scale)
+
+        def act(key: jax.Array, state: Any, observation: jax.Array, params: Any) -> jax.Array:
+            return experts.act(policy, observation)
+
+        episodes = make_evaluate(env, act)(held_out, jax.random.key(0))
+        return Curve(episodes, learner.counters, learner.diverged)
+
+    def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
+        learner = functions.init(key, hparams)
+        *first, (last, length) = phases(config)
+        if last != "interact":
+            first, length = [*first, (last, length)], 0
+        for phase, count in first:
+            learner, _ = functions.run_chunk(learner, count // interval, phase)
+        if not length:
+            return jax.tree.map(lambda leaf: leaf[None], look(learner, held_out))
+
+        def part(learner: Learner, _: None) -> tuple[Learner, Curve]:
+            learner, _ = functions.run_chunk(learner, every // interval)
+            return learner, look(learner, held_out)
+
+        learner, curve = jax.lax.scan(part, learner, None, length=length // every)
+        if length % every:
+            learner, _ = functions.run_chunk(learner, length % every // interval)
+            end = look(learner, held_out)
+            curve = jax.tree.map(lambda many, one: jnp.append(many, one[None], 0), curve, end)
+        return curve
+
+    return lane
+
+
+def make_batch(lane: Lane, side_by_side: bool) -> Callable[[jax.Array, HParams, PyTree], Curve]:
+    """`batch(keys [B], hparams [B], held_out_params) -> Curve` with a leading [B].
+
+    Args:
+        lane: One run.
+        side_by_side: Step the runs together (`vmap`), or one after another (`lax.map`).
+    """
+    if side_by_side:
+        return jax.vmap(lane, in_axes=(0, 0, None))
+
+    def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
+        return jax.lax.map(lambda run: lane(*run, held_out), (keys, hparams))
+
+    return one_after_another
+
+
+def stack(hparams: list[HParams]) -> HParams:
+    """Runs' hyper-parameters as one pytree of float32 arrays [B]."""
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.array(leaves, np.float32)), *hparams)
+
+
+def split(batch: PyTree, devices: list[jax.Device]) -> PyTree:
+    """A batch [B, ...] with its runs shared out over devices; B is a multiple of their number."""
+    mesh = Mesh(np.array(devices), ("runs",))
+    return jax.device_put(batch, NamedSharding(mesh, PartitionSpec("runs")))
+
+
+def lane_bytes(functions: TrainFunctions, hparams: HParams) -> int:
+    """Memory that one run's state takes, bytes: its buffers, parameters and world."""
+    learner = jax.eval_shape(functions.init, jax.random.key(0), hparams)
+    leaves = jax.tree.leaves(learner)
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
