@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
+import scipy.stats
 
+from ppl_jax import statistics
 from ppl_jax.statistics import interquartile_mean, mean_interval, paired_difference
 
 
@@ -41,3 +43,41 @@ def test_the_same_generator_gives_the_same_interval():
 
 def test_interquartile_mean_leaves_out_the_tails():
     assert interquartile_mean(np.array([-100.0, 1, 2, 3, 4, 5, 6, 100])) == pytest.approx(3.5)
+
+
+def test_interquartile_mean_is_scipys_trimmed_mean():
+    for size in (4, 5, 7, 10, 50):
+        scores = np.random.default_rng(size).normal(size=size)
+        expected = scipy.stats.trim_mean(scores, 0.25)
+        assert statistics.interquartile_mean(scores) == pytest.approx(expected)
+
+
+def test_interval_of_the_interquartile_mean_is_scipys():
+    scores = np.random.default_rng(1).normal(size=20)
+    ours = statistics.interquartile_interval(scores[None], np.random.default_rng(0), 0.95, 20_000)
+    theirs = scipy.stats.bootstrap(
+        (scores,),
+        lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis=axis),
+        n_resamples=20_000,
+        method="percentile",
+        random_state=np.random.default_rng(1),
+    ).confidence_interval
+    assert ours.low == pytest.approx(theirs.low, abs=0.02)
+    assert ours.high == pytest.approx(theirs.high, abs=0.02)
+
+
+def test_the_interval_keeps_to_its_tasks():
+    """Two tasks of one run each cannot vary: strata are resampled within, never across."""
+    ours = statistics.interquartile_interval([[0.0], [1.0]], np.random.default_rng(0))
+    assert (ours.mean, ours.low, ours.high) == (0.5, 0.5, 0.5)
+
+
+def test_probability_of_improvement_is_mann_whitneys():
+    rng = np.random.default_rng(3)
+    ours, theirs = rng.integers(0, 6, 9), rng.integers(0, 5, 7)
+    expected = scipy.stats.mannwhitneyu(ours, theirs).statistic / (9 * 7)
+    found = statistics.probability_of_improvement(ours[None], theirs[None], rng)
+    assert found.mean == pytest.approx(expected)
+    assert found.low < found.mean < found.high
+    sure = statistics.probability_of_improvement([[2.0, 3.0]], [[0.0, 1.0]], rng)
+    assert (sure.mean, sure.low, sure.high) == (1.0, 1.0, 1.0)
