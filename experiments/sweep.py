@@ -111,7 +111,10 @@ def sweep(command: Sweep) -> None:
     failed = {}
     with Progress(len(runs), "runs", len(done)) as progress:
         progress.start()
-        for number, reply in _engine(command, [job for job, _ in jobs], log, batch):
+        for number, reply in _engine(command, [job for job, _ in jobs], log):
+            progress.began += reply.get("compile_s", 0.0) / _workers(
+                command
+            )  # not for what is left
             for run, rows in _replies(reply, jobs[number], runs):
                 if isinstance(rows, str):
                     failed[run.name] = rows
@@ -242,9 +245,7 @@ def _jobs(
             yield job, mine
 
 
-def _engine(
-    command: Sweep, jobs: Sequence[Job], log: Path, batch: int
-) -> Iterator[tuple[int, Reply]]:
+def _engine(command: Sweep, jobs: Sequence[Job], log: Path) -> Iterator[tuple[int, Reply]]:
     if command.engine == "ray":
         return engines.ray_cluster(jobs, command.address)
     if _accelerated():
