@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 import time
 from pathlib import Path
@@ -429,6 +430,46 @@ class Expert:
 
 
 @dataclasses.dataclass
+class Table:
+    """Print results as a table: Markdown, LaTeX or plain."""
+
+    results: Positional[Path]
+    """Folder of ppl sweep, compare or ablation, or its results.csv."""
+    step: int | None = None
+    """Environment steps (default: the end of each run)."""
+    format: Literal["text", "markdown", "latex"] = "text"
+    """How to write it."""
+    against: str | None = None
+    """Row that the others are compared with (default: the first)."""
+    paper: bool = False
+    """Show the paper's own figures beside ours."""
+    env: str | None = None
+    """World of results that do not name theirs (those of ppl compare)."""
+
+
+@dataclasses.dataclass
+class Figure:
+    """Draw results."""
+
+    results: Positional[Path]
+    """Folder of ppl sweep, compare or ablation, its results.csv, a folder of experts' cards, or
+    (kind steering) a run folder or policy file."""
+    other: Positional[tuple[Path, ...]] = ()
+    """Kind steering: more of them."""
+    kind: Literal["curves", "axis", "heatmap", "training", "experts", "steering"] | None = None
+    """Learning curves; success over one setting, or two; takeovers and cost in training; training
+    of experts; steering on one map (default: what the results have)."""
+    column: Literal["success", "progress", "episodic_return", "episodic_cost"] = "success"
+    """What is drawn."""
+    steps: tuple[int, ...] = ()
+    """Kind axis: steps to draw (default: the end of each run)."""
+    scenario: int = 1000
+    """Kind steering: number of a held-out scenario."""
+    out: Path = Path("figure.png")
+    """File to write; its ending decides how."""
+
+
+@dataclasses.dataclass
 class Export:
     """Write a run's policy as one file that plain NumPy can run."""
 
@@ -484,6 +525,8 @@ Command = (
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Robustness, subcommand("robustness")]
+    | Annotated[Table, subcommand("table")]
+    | Annotated[Figure, subcommand("figure")]
     | Annotated[Expert, subcommand("expert")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
@@ -611,6 +654,19 @@ def _sweep(command: Sweep) -> None:
     sweep(command)
 
 
+def _table(command: Table) -> None:
+    from experiments.report import table
+
+    table(command)
+
+
+def _figure(command: Figure) -> None:
+    from experiments.figures import figure
+
+    figure(command)
+    print(f"wrote {command.out}")
+
+
 def _expert(command: Expert) -> None:
     if isinstance(command.command, ExpertTrain):
         _expert_train(command.command)
@@ -713,6 +769,8 @@ _ACTIONS = {
     Tune: _tune,
     Sweep: _sweep,
     Robustness: _sweep,
+    Table: _table,
+    Figure: _figure,
     Expert: _expert,
     Export: _export,
     Render: _render,
@@ -734,6 +792,9 @@ def main(argv: list[str] | None = None) -> None:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -143,7 +143,7 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
         raise UserError(f"address: no Ray cluster at {address!r}: {error}") from error
     task = ray.remote(num_cpus=1, max_retries=-1)(_task)
     try:
-        numbers = {task.remote(job): number for number, job in enumerate(jobs)}
+        numbers = {task.remote(job, sys.argv[0]): number for number, job in enumerate(jobs)}
         left = list(numbers)
         while left:
             ready, left = ray.wait(left, num_returns=1)
@@ -156,15 +156,23 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
         ray.shutdown()
 
 
-def _task(job: Job) -> Reply:
-    """A job in a Ray worker, which keeps its programs and its core for the next one."""
+def _task(job: Job, program: str) -> Reply:
+    """A job in a Ray worker, which keeps its programs and its core for the next one.
+
+    The program that was called is run first, without its main part, where it is a script: it may
+    register methods or worlds of its own.
+    """
     global _worker
+    import runpy
+
     from experiments.runtime import start_jax
     from experiments.worker import Worker
 
     if _worker is None:
         _claim_core()
         start_jax()
+        if program.endswith(".py"):
+            runpy.run_path(program, run_name="worker")
         _worker = Worker()
     return _worker.run(job)
 

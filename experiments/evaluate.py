@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import functools
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs import make, pretrained
-from experiments.policy_file import load_policy
+from experiments.policy_file import load_meta, load_policy
 from experiments.runtime import UserError
 from ppl_jax import experts
 from ppl_jax.evaluation import Episodes, make_evaluate
@@ -130,10 +128,12 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
     """The world of a run folder (or of a policy file's meta) and how it was built."""
     if run.is_file():
         try:
-            with open(run, "rb") as file, np.load(file, allow_pickle=False) as archive:
-                return json.loads(str(archive["meta"]))["env"], {}
-        except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
-            raise UserError(f"policy file {str(run)!r} cannot be read: {error}") from error
+            meta = load_meta(run)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        if not isinstance(meta, dict) or "env" not in meta:
+            raise UserError(f"policy file {str(run)!r} cannot be read: its meta names no env")
+        return meta["env"], {}
     try:
         config = RunFolder(run).config()
     except ValueError as error:

@@ -1,86 +1,252 @@
-"""Figures, from result files only: `python -m experiments.figures RESULTS.csv OUT.png`.
+"""`ppl figure`: pictures from result files alone.
 
-With a folder of experts' curves (`envs/pretrained`) in the place of RESULTS.csv it draws those.
+Lines differ in marker and dash as well as in colour; every picture says what its bars are, over how
+many seeds, and in which units.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-import sys
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ppl_jax.statistics import mean_interval
+from experiments.report import Point, at_step, read_points
+from experiments.runtime import UserError
+
+if TYPE_CHECKING:
+    from experiments.cli import Figure
+
+NAMES = {
+    "success": "held-out success",
+    "progress": "held-out share of the task done",
+    "episodic_return": "held-out return per episode",
+    "episodic_cost": "held-out cost per episode",
+}
+SETTINGS = {
+    "preference_horizon": "preference horizon L (steps)",
+    "prediction_horizon": "prediction horizon H (steps)",
+    "beta": "temperature beta",
+    "prediction_noise": "prediction noise epsilon (share of |s|)",
+    "expert_noise": "noise on the expert's action (std)",
+    "learning_rate": "learning rate",
+    "bc_weight": "weight of the cloning loss",
+}
+MARKERS, DASHES = "osD^vP*Xph", ["-", "--", "-.", ":"]
+_OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
 
 
-def learning_curves(results: Path, out: Path, column: str = "success") -> None:
-    """Held-out success against steps and against human data, one line per method.
+def figure(command: Figure) -> None:
+    """Draw what was asked for.
 
-    Bands are 95% intervals over seeds. Methods that learn from demonstrations alone are dots.
-
-    Args:
-        results: A results.csv of `ppl compare` or `ppl ablation`.
-        out: Picture to write.
-        column: What to draw.
+    Raises:
+        UserError: If the results do not have it.
     """
+    if command.kind == "steering":
+        from experiments.steering import steering
+
+        steering([command.results, *command.other], command.scenario, command.out)
+        return
+    if command.other:
+        raise UserError("more than one path is for --kind steering alone")
+    cards = command.results.is_dir() and bool(list(command.results.glob("*.npz")))
+    if command.kind == "experts" or (command.kind is None and cards):
+        expert_curves(command.results, command.out)
+        return
+    points = read_points(command.results)
+    several = _varied(points)
+    kind = command.kind or {0: "curves", 1: "axis", 2: "heatmap"}.get(len(several), "curves")
+    if kind == "curves":
+        curves(points, command.out, command.column)
+    elif kind == "training":
+        training(points, command.out)
+    elif len(several) != (need := {"axis": 1, "heatmap": 2}[kind]):
+        what = ", ".join(several) or "none"
+        raise UserError(f"kind {kind} needs results over {need} settings, these have {what}")
+    elif kind == "axis":
+        over_axis(points, several[0], command.out, command.column, command.steps)
+    else:
+        heatmap(points, several, command.out, command.column)
+
+
+def _varied(points: Sequence[Point]) -> list[str]:
+    """Settings that differ between points of one method, and mean something for all of them."""
+    names = list(dict.fromkeys(name for point in points for name in point.values))
+    return [name for name in names if all(name in point.values for point in points)]
+
+
+def _canvas(rows: int, columns: int, size: tuple[float, float]) -> Any:
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    with open(results, newline="") as file:
-        rows = list(csv.DictReader(file))
-    figure, (by_step, by_human) = pyplot.subplots(1, 2, figsize=(11, 4.2), sharey=True)
-    rng = np.random.default_rng(0)
-    colours = pyplot.get_cmap("tab10")
-    labels = list(dict.fromkeys(row["algorithm"] for row in rows))
-    longest = max(
-        (int(row["step"]) for row in rows if row["algorithm"] not in _OFFLINE), default=None
-    )
-    for i, label in enumerate(labels):
-        mine = [row for row in rows if row["algorithm"] == label]
-        steps = sorted({int(row["step"]) for row in mine})
-        means, lows, highs, human = [], [], [], []
-        for step in steps:
-            at = [row for row in mine if int(row["step"]) == step]
-            scores = np.array([[float(row[column])] for row in at])
-            interval = mean_interval(scores, rng)
-            means.append(interval.mean)
-            lows.append(interval.low)
-            highs.append(interval.high)
-            human.append(np.mean([float(row["human_data_usage"]) for row in at]))
-        wide = 2.5 if i == 0 else 1.3
-        if label in _OFFLINE:  # another axis altogether: its end alone
-            by_human.errorbar(
-                human[-1],
-                means[-1],
-                [[means[-1] - lows[-1]], [highs[-1] - means[-1]]],
-                fmt="o",
-                color=colours(i % 10),
-                label=label,
-            )
+    return pyplot.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+
+
+def _finish(picture: Any, caption: str, out: Path) -> None:
+    """Put the caption under the picture and write it."""
+    from matplotlib import pyplot
+
+    wide = int(picture.get_figwidth() * 15)
+    picture.supxlabel("\n".join(textwrap.wrap(caption, wide)), fontsize=8, x=0.02, ha="left")
+    picture.savefig(out, dpi=130)
+    pyplot.close(picture)
+
+
+def _plain(axes: Any) -> None:
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _seeds(points: Sequence[Point]) -> str:
+    counts = sorted({len(point.seeds) for point in points})
+    return f"n = {' to '.join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))} seeds"
+
+
+def _style(i: int) -> dict[str, Any]:
+    return {
+        "color": f"C{i % 10}",
+        "marker": MARKERS[i % len(MARKERS)],
+        "linestyle": DASHES[i % len(DASHES)],
+        "markersize": 5,
+        "markerfacecolor": "white" if i % 2 else f"C{i % 10}",
+    }
+
+
+def _lines(points: Sequence[Point]) -> dict[str, list[Point]]:
+    """Points of the same runs, by label, each in the order of its steps."""
+    several = len({point.env for point in points}) > 1
+    found: dict[str, list[Point]] = {}
+    for point in points:
+        name = f"{point.env} {point.label}" if several else point.label
+        found.setdefault(name, []).append(point)
+    return {name: sorted(mine, key=lambda point: point.step) for name, mine in found.items()}
+
+
+def curves(points: Sequence[Point], out: Path, column: str) -> None:
+    """A column against steps and against human data, one line per method and setting."""
+    picture, ((by_step, by_human),) = _canvas(1, 2, (11, 4.6))
+    for i, (name, mine) in enumerate(_lines(points).items()):
+        found = [point.interval(column) for point in mine]
+        mean, low, high = (np.array(part) for part in zip(*found, strict=True))
+        human = [point.measured["human_data_usage"].mean() for point in mine]
+        style = _style(i)
+        if mine[0].algorithm in _OFFLINE:  # another axis altogether: its end alone
+            bar = [[mean[-1] - low[-1]], [high[-1] - mean[-1]]]
+            by_human.errorbar(human[-1], mean[-1], bar, **style, label=name)
             continue
-        by_step.plot(steps, means, color=colours(i % 10), linewidth=wide, label=label)
-        by_step.fill_between(steps, lows, highs, color=colours(i % 10), alpha=0.12, linewidth=0)
-        by_human.plot(human, means, color=colours(i % 10), linewidth=wide, label=label)
-    if longest:
-        by_step.set_xlim(0, longest)
-    by_step.set_xlabel("environment steps")
-    by_human.set_xlabel("steps under the expert's control")
-    by_human.set_xscale("log")
-    by_step.set_ylabel(f"held-out {column}")
-    by_step.set_ylim(0, 1)
+        steps = [point.step for point in mine]
+        by_step.plot(steps, mean, **style, label=name)
+        by_step.fill_between(steps, low, high, color=style["color"], alpha=0.12, linewidth=0)
+        by_human.plot(human, mean, **style, label=name)
+    by_step.set(xlabel="environment steps", ylabel=NAMES[column])
+    by_human.set(xlabel="steps under the expert's control", xscale="log")
     for axes in (by_step, by_human):
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    handles, names = by_human.get_legend_handles_labels()
-    figure.legend(handles, names, loc="center right", frameon=False)
-    figure.tight_layout(rect=(0, 0, 0.85, 1))
-    figure.savefig(out, dpi=120)
-    pyplot.close(figure)
+        _plain(axes)
+        if column in ("success", "progress"):
+            axes.set_ylim(0, 1.02)
+    by_human.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _finish(picture, f"Means with 95% bootstrap intervals, {_seeds(points)}.", out)
+
+
+def over_axis(
+    points: Sequence[Point], name: str, out: Path, column: str, steps: Sequence[int]
+) -> None:
+    """A column over the values of one setting, one line per method and step."""
+    envs = list(dict.fromkeys(point.env for point in points))
+    picture, (row,) = _canvas(1, len(envs), (1.5 + 4.6 * len(envs), 4.6))
+    for axes, env in zip(row, envs, strict=True):
+        mine = [point for point in points if point.env == env]
+        wanted = steps or sorted({point.step for point in at_step(mine, None)})
+        values = list(dict.fromkeys(point.values[name] for point in mine))
+        i = 0
+        for algorithm in dict.fromkeys(point.algorithm for point in mine):
+            for step in wanted:
+                here = {
+                    point.values[name]: point.interval(column)
+                    for point in at_step(mine, step)
+                    if point.algorithm == algorithm
+                }
+                at = [x for x, value in enumerate(values) if value in here]
+                mean, low, high = (
+                    np.array(part) for part in zip(*(here[values[x]] for x in at), strict=True)
+                )
+                shifted = np.array(at) + 0.06 * i
+                label = f"{algorithm}, {step:,} steps"
+                bars = [mean - low, high - mean]
+                axes.errorbar(shifted, mean, bars, capsize=3, label=label, **_style(i))
+                i += 1
+        axes.set_xticks(range(len(values)), values)
+        axes.set(xlabel=SETTINGS.get(name, name), ylabel=NAMES[column], title=env)
+        if column in ("success", "progress"):
+            axes.set_ylim(0, 1.02)
+        _plain(axes)
+        axes.legend(frameon=False, fontsize=8, loc="lower left")
+    _finish(picture, f"Means with 95% bootstrap intervals over seeds, {_seeds(points)}.", out)
+
+
+def heatmap(points: Sequence[Point], names: Sequence[str], out: Path, column: str) -> None:
+    """A column over the values of two settings, one panel per world and method; figures inside."""
+    points = at_step(points, None)
+    panels = list(dict.fromkeys((point.env, point.algorithm) for point in points))
+    picture, (row,) = _canvas(1, len(panels), (1.2 + 4.4 * len(panels), 4.4))
+    every = [point.measured[column].mean() for point in points]
+    for axes, (env, algorithm) in zip(row, panels, strict=True):
+        mine = [point for point in points if (point.env, point.algorithm) == (env, algorithm)]
+        across, down = (list(dict.fromkeys(p.values[name] for p in mine)) for name in names)
+        grid = np.full((len(down), len(across)), np.nan)
+        for point in mine:
+            x, y = across.index(point.values[names[0]]), down.index(point.values[names[1]])
+            interval = point.interval(column)
+            grid[y, x] = interval.mean
+            bright = (interval.mean - min(every)) / max(max(every) - min(every), 1e-9)
+            text = f"{interval.mean:.2f}\n[{interval.low:.2f}, {interval.high:.2f}]"
+            colour = "black" if bright > 0.5 else "white"
+            axes.text(x, y, text, ha="center", va="center", fontsize=8, color=colour)
+        drawn = axes.imshow(grid, cmap="cividis", vmin=min(every), vmax=max(every), aspect="auto")
+        axes.set_xticks(range(len(across)), across)
+        axes.set_yticks(range(len(down)), down)
+        axes.set(xlabel=SETTINGS.get(names[0], names[0]), ylabel=SETTINGS.get(names[1], names[1]))
+        axes.set_title(" ".join(part for part in (env, algorithm) if part))
+    picture.colorbar(drawn, ax=row, label=NAMES[column])
+    steps = sorted({point.step for point in points})
+    caption = f"Means over {_seeds(points)} with 95% bootstrap intervals, after "
+    _finish(picture, caption + " or ".join(f"{step:,}" for step in steps) + " steps.", out)
+
+
+def training(points: Sequence[Point], out: Path) -> None:
+    """Share of steps under the expert and cost per 1,000 steps, between evaluations."""
+    if any("training_cost" not in point.measured for point in points):
+        raise UserError("kind training needs results of ppl sweep, which count cost in training")
+    picture, ((rate, cost),) = _canvas(1, 2, (11, 4.6))
+    for i, (name, mine) in enumerate(_lines(points).items()):
+        steps = np.array([0] + [point.step for point in mine])
+        middle, length = (steps[1:] + steps[:-1]) / 2, np.diff(steps)
+        for axes, column, unit in (
+            (rate, "human_data_usage", 1.0),
+            (cost, "training_cost", 1000.0),
+        ):
+            totals = np.stack([point.measured[column] for point in mine])
+            spent = np.diff(totals, axis=0, prepend=0) / length[:, None] * unit
+            found = [
+                Point("", "", {}, 0, mine[0].seeds, {column: row}).interval(column) for row in spent
+            ]
+            mean, low, high = (np.array(part) for part in zip(*found, strict=True))
+            axes.plot(middle, mean, **_style(i), label=name)
+            axes.fill_between(middle, low, high, color=f"C{i % 10}", alpha=0.12, linewidth=0)
+    rate.set(xlabel="environment steps", ylabel="share of steps under the expert's control")
+    cost.set(xlabel="environment steps", ylabel="cost per 1,000 training steps")
+    for axes in (rate, cost):
+        axes.set_ylim(bottom=0)
+        _plain(axes)
+    cost.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    caption = "Between evaluations; means with 95% bootstrap intervals over seeds, "
+    _finish(picture, f"{caption}{_seeds(points)}.", out)
 
 
 def expert_curves(folder: Path, out: Path) -> None:
@@ -89,14 +255,14 @@ def expert_curves(folder: Path, out: Path) -> None:
     Args:
         folder: With a NAME.csv and a NAME.json for each, as `ppl expert card` writes them.
         out: Picture to write.
+
+    Raises:
+        UserError: If there is none.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    paths = sorted(folder.glob("*.csv"))
-    figure, rows = pyplot.subplots(len(paths), 3, figsize=(11, 2.6 * len(paths)), squeeze=False)
+    paths = sorted(path for path in folder.glob("*.csv") if path.with_suffix(".json").is_file())
+    if not paths:
+        raise UserError(f"{str(folder)!r} holds no cards of `ppl expert card`")
+    picture, rows = _canvas(len(paths), 3, (11, 2.6 * len(paths) + 0.4))
     for (success, cost, multiplier), path in zip(rows, paths, strict=True):
         limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
         with open(path, newline="") as file:
@@ -124,19 +290,9 @@ def expert_curves(folder: Path, out: Path) -> None:
         multiplier.set_ylabel("multiplier")
         multiplier.set_ylim(bottom=0)
         for axes in (success, cost, multiplier):
-            axes.grid(alpha=0.25)
-            axes.spines[["top", "right"]].set_visible(False)
+            _plain(axes)
     for axes in rows[-1]:
         axes.set_xlabel("environment steps, millions")
     rows[0][0].legend(frameon=False)
     rows[0][1].legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(out, dpi=120)
-    pyplot.close(figure)
-
-
-_OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
-
-if __name__ == "__main__":
-    draw = expert_curves if Path(sys.argv[1]).is_dir() else learning_curves
-    draw(Path(sys.argv[1]), Path(sys.argv[2]))
+    _finish(picture, "One seed each; held out: 50 scenarios, each once.", out)

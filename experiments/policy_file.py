@@ -103,3 +103,16 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     if not (scale > 0).all():
         raise ValueError(f"{name}: obs_scale must be positive")
     return SavedPolicy(weights, activation, output, mean, scale, log_std)
+
+
+def load_meta(path: str | Path) -> dict[str, Any]:
+    """What a policy file says about itself.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            return json.loads(str(archive["meta"]))
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"policy file {str(path)!r} cannot be read: {error}") from error

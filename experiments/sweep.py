@@ -182,7 +182,10 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> i
     memory = 0
     for group in wanted if command.engine == "local" else ():
         env, expert = build(group.settings)
-        made = make_train(env, expert, maker(group.settings, env), group.settings.config)
+        try:
+            made = make_train(env, expert, maker(group.settings, env), group.settings.config)
+        except ValueError:
+            continue  # its runs will say so; the others go on
         memory = max(memory, lane_bytes(made, group.settings.hparams))
     batch = command.batch or _batch(memory, len(waiting))
     compiles = len({(group_key(g.settings), min(len(g.runs), batch)) for g in wanted})

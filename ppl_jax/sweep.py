@@ -41,12 +41,14 @@ Lane = Callable[[jax.Array, HParams, PyTree], Curve]
 
 
 def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
-    """Environment steps at which a run is evaluated: every so many, and at its end."""
-    interact = config.total_steps - config.demonstrations
-    if not interact:
-        return [config.total_steps]
-    steps = [config.demonstrations + n for n in range(every, interact + 1, every)]
-    return steps if interact % every == 0 else [*steps, config.total_steps]
+    """Environment steps at which a run is evaluated.
+
+    After what it learns offline, then every so many steps, and at its end.
+    """
+    begun, end = config.demonstrations, config.total_steps
+    steps = [begun] if config.offline_updates else []
+    steps += range(begun + every, end + 1, every)
+    return steps if steps and steps[-1] == end else [*steps, end]
 
 
 def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> Lane:
@@ -64,6 +66,9 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
     """
     interval = config.decision_interval
 
+    def one(curve: Curve) -> Curve:
+        return jax.tree.map(lambda leaf: leaf[None], curve)
+
     def look(learner: Learner, held_out: PyTree) -> Curve:
         layers = functions.algorithm.policy(learner.algorithm)
         mean, scale = env.spec.observation_mean, env.spec.observation_scale
@@ -76,25 +81,26 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
         return Curve(episodes, learner.counters, learner.diverged)
 
     def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
-        learner = functions.init(key, hparams)
-        *first, (last, length) = phases(config)
-        if last != "interact":
-            first, length = [*first, (last, length)], 0
-        for phase, count in first:
-            learner, _ = functions.run_chunk(learner, count // interval, phase)
-        if not length:
-            return jax.tree.map(lambda leaf: leaf[None], look(learner, held_out))
+        learner, curves = functions.init(key, hparams), []
 
-        def part(learner: Learner, _: None) -> tuple[Learner, Curve]:
-            learner, _ = functions.run_chunk(learner, every // interval)
+        def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, Curve]:
+            learner, _ = functions.run_chunk(learner, steps // interval)
             return learner, look(learner, held_out)
 
-        learner, curve = jax.lax.scan(part, learner, None, length=length // every)
-        if length % every:
-            learner, _ = functions.run_chunk(learner, length % every // interval)
-            end = look(learner, held_out)
-            curve = jax.tree.map(lambda many, one: jnp.append(many, one[None], 0), curve, end)
-        return curve
+        for phase, length in phases(config):
+            if phase != "interact":
+                learner, _ = functions.run_chunk(learner, length // interval, phase)
+                if phase == "fit":
+                    curves.append(one(look(learner, held_out)))
+                continue
+            learner, curve = jax.lax.scan(part, learner, None, length=length // every)
+            curves.append(curve)
+            if length % every:
+                learner, last = part(learner, None, length % every)
+                curves.append(one(last))
+        if not curves:  # demonstrations that nothing is learnt from
+            curves.append(one(look(learner, held_out)))
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *curves)
 
     return lane
 
