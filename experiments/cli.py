@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal, get_args, get_type_hints
+from typing import Annotated, Literal, Union, get_args, get_type_hints
 
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
@@ -36,8 +36,8 @@ class Train:
     """Steps at the start that the expert makes all by itself."""
     offline_updates: int | None = None
     """Updates on them before the novice makes its first step."""
-    preference_horizon: int | None = None
-    """L: predicted states that get a preference pair."""
+    preference_horizon: int | Literal["auto"] | None = None
+    """L: predicted states that get a preference pair; auto chooses it while training."""
     prediction_horizon: int | None = None
     """H: steps of the lookahead the expert sees."""
     beta: float | None = None
@@ -352,7 +352,8 @@ def _axes() -> type:
     fields = []
     for field in dataclasses.fields(Train):
         if field.name not in _NO_AXES:
-            kind = next(part for part in get_args(hints[field.name]) if part is not type(None))
+            kinds = tuple(part for part in get_args(hints[field.name]) if part is not type(None))
+            kind = Union[kinds]  # noqa: UP007
             told = tyro.conf.arg(help=f"Values of {field.name}; see `ppl train --help`.")
             fields.append((field.name, Annotated[tuple[kind, ...], told], ()))
     return dataclasses.make_dataclass("Axes", fields)
@@ -535,6 +536,9 @@ Command = (
 )
 
 
+MOST_PAIRS = 10  # that preference_horizon "auto" may choose
+
+
 def run_settings(command: Train):
     """Turn the command line into settings of a run."""
     from experiments.train import RunSettings
@@ -548,6 +552,10 @@ def run_settings(command: Train):
         name: value for name, value in dataclasses.asdict(command).items() if value is not None
     }
     static = {f.name: given[f.name] for f in dataclasses.fields(config) if f.name in given}
+    if given.get("preference_horizon") == "auto":
+        static["adaptive_horizon"] = True
+        longest = static.get("prediction_horizon", config.prediction_horizon)
+        given["preference_horizon"] = max(1, min(MOST_PAIRS, longest))
     if "total_steps" in static and "demonstrations" not in static:
         static["demonstrations"] = min(config.demonstrations, max(static["total_steps"], 0))
         if not static["demonstrations"]:

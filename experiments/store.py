@@ -106,7 +106,7 @@ class Results:
         settings = run.settings
         hparams = {k: f"{v:g}" for k, v in dataclasses.asdict(settings.hparams).items()}
         static = {name: getattr(settings.config, name) for name in _STATIC}
-        whole = self._where(run) | dict(run.values) | static | hparams | row
+        whole = self._where(run) | static | hparams | dict(run.values) | row
         return {name: plain(whole.get(name, "")) for name in self.columns}
 
     def _episode(self, run: Run, last: dict[str, Any], row: dict[str, Any]) -> dict[str, str]:

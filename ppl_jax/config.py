@@ -78,6 +78,8 @@ class TrainConfig:
         prediction_horizon: H, steps of the lookahead the expert sees.
         decision_interval: Steps a decision holds; a new one is made at steps 0, K, 2K, ...
         max_preference_horizon: Largest L a run may use (L itself is traced).
+        adaptive_horizon: L is chosen while training, up to `HParams.preference_horizon`, from what
+            the expert would do at predicted states (see `ppl_jax.horizon`).
         batch_size: Samples per loss and update.
         hidden: Widths of the policy's hidden layers.
         human_capacity, preference_capacity: Of the ring buffers; the oldest go first.
@@ -108,6 +110,7 @@ class TrainConfig:
     prediction_horizon: int = 10
     decision_interval: int = 10
     max_preference_horizon: int = 10
+    adaptive_horizon: bool = False
     batch_size: int = 256
     hidden: tuple[int, ...] = (256, 256)
     human_capacity: int = 50_000

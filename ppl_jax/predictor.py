@@ -28,6 +28,7 @@ def predict(
     observe: bool = False,
     act: Act | None = None,
     expert: Expert | None = None,
+    advisor: Expert | None = None,
 ) -> Trajectory:
     """Roll `horizon` steps from `state`.
 
@@ -44,6 +45,7 @@ def predict(
         observe: Also return the observation of every predicted state.
         act: Policy asked again at every predicted state (the released code's gate).
         expert: Expert asked at every predicted state, the first included; `action` is ignored.
+        advisor: Expert that only says what it would do at every predicted state.
     """
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Trajectory]:
@@ -57,6 +59,9 @@ def predict(
         observation = env.observe(after, params) if observe or act is not None else empty
         if act is not None:
             action = act(observation)
+        advice = None
+        if advisor is not None:
+            advice = advisor(key, after, env.observe(after, params), params)
         predicted = Trajectory(
             observation=observation if observe else empty,
             reward=jnp.where(alive, outcome.reward, 0.0),
@@ -65,6 +70,7 @@ def predict(
             success=alive & outcome.success,
             terminated=alive & outcome.terminated,
             valid=alive,
+            advice=advice,
         )
         alive = alive & ~(outcome.terminated | outcome.truncated)
         return (after, action, alive), predicted

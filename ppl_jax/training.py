@@ -202,7 +202,17 @@ def make_train(
     ) -> Trajectory:
         def roll() -> Trajectory:
             horizon = config.max_preference_horizon
-            return predict(env, transition, key, state, action, params, horizon, observe=True)
+            return predict(
+                env,
+                transition,
+                key,
+                state,
+                action,
+                params,
+                horizon,
+                observe=True,
+                advisor=expert if config.adaptive_horizon else None,
+            )
 
         def nothing() -> Trajectory:
             return jax.tree.map(

@@ -64,6 +64,7 @@ class Trajectory:
         reward, speed: Of each predicted step.
         unsafe, success, terminated: Booleans.
         valid: The step was made: the prediction had not ended before it.
+        advice: [H, A] the expert's action at each predicted state, where it was asked, else None.
     """
 
     observation: jax.Array
@@ -73,6 +74,7 @@ class Trajectory:
     success: jax.Array
     terminated: jax.Array
     valid: jax.Array
+    advice: jax.Array | None = None
 
 
 @flax.struct.dataclass

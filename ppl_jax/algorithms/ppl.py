@@ -10,7 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from ppl_jax import buffers
+from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
@@ -40,12 +40,14 @@ class PPLState:
         preference_buffer: D_pref of `PreferenceBatch`.
         random_actions: [2, C, A] that stand in for preferred and rejected actions of the rows of
             `preference_buffer` in ablations; None otherwise.
+        horizon: What L is chosen from where it is chosen while training; None otherwise.
     """
 
     learned: Learned
     human_buffer: RingBuffer
     preference_buffer: RingBuffer
     random_actions: jax.Array | None
+    horizon: horizon.Horizon | None
 
 
 def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None = None) -> Algorithm:
@@ -67,6 +69,7 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
     policy = make_policy(spec, config.hidden)
     shifted = config.pair_states == "shifted"
     random = "random" in (config.preferred, config.rejected)
+    adaptive = config.adaptive_horizon
 
     def init(key: jax.Array) -> PPLState:
         observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
@@ -82,11 +85,34 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
             ),
             preference_buffer=buffers.init_buffer(pair, rows),
             random_actions=actions,
+            horizon=horizon.init_horizon(config.max_preference_horizon) if adaptive else None,
         )
 
     def act(state: PPLState, key: jax.Array, observation: jax.Array) -> jax.Array:
         del key
         return policy.apply(state.learned.params, observation)
+
+    def watch(state: PPLState, step: Interaction) -> PPLState:
+        """What the expert would do at the predicted states, where it was asked."""
+        predicted = step.predicted
+        if state.horizon is None or predicted.advice is None:
+            return state
+        found = horizon.measure(
+            step.observation,
+            predicted.observation,
+            predicted.advice,
+            step.expert_action,
+            step.novice_action,
+            jnp.asarray(spec.observation_scale),
+        )
+        seen = step.takeover & predicted.valid
+        return dataclasses.replace(state, horizon=horizon.add(state.horizon, found, seen))
+
+    def pairs_per_step(state: PPLState, hparams: HParams) -> jax.Array | float:
+        """L."""
+        if state.horizon is None:
+            return hparams.preference_horizon
+        return horizon.choose(state.horizon, hparams.preference_horizon)
 
     def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
         human = buffers.add(
@@ -94,7 +120,8 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
             (step.observation[None], step.expert_action[None]),
             step.takeover[None],
         )
-        pairs, mask = preference_pairs(step, hparams.preference_horizon, config.pair_states)
+        state = watch(state, step)
+        pairs, mask = preference_pairs(step, pairs_per_step(state, hparams), config.pair_states)
         if state.random_actions is not None:
             rank = jnp.cumsum(mask) - 1
             rows = (state.preference_buffer.next + rank) % config.preference_capacity
@@ -154,6 +181,8 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
             state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
         )
         learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+        if adaptive:
+            metrics = metrics | {"preference_horizon": pairs_per_step(state, hparams)}
         return dataclasses.replace(state, learned=learned), metrics
 
     def policy_layers(state: PPLState) -> Layers:

@@ -1,0 +1,86 @@
+"""What L buys and costs: the measurements against loops, and the choice on a world that is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ppl_jax import horizon
+from ppl_jax.training import make_train
+from tests.probes import Probe
+from tests.test_algorithms import probe_settings
+
+RNG = np.random.default_rng(4)
+
+
+def test_measurements_against_a_loop():
+    here, ahead, scale = RNG.normal(size=3), RNG.normal(size=(5, 3)), np.array([1.0, 2.0, 0.5])
+    advice, preferred, rejected = RNG.normal(size=(5, 2)), RNG.normal(size=2), RNG.normal(size=2)
+    found = horizon.measure(here, ahead, advice, preferred, rejected, scale)
+    for i in range(5):
+        drift = np.sqrt(((advice[i] - preferred) ** 2).sum())
+        other = np.sqrt(((advice[i] - rejected) ** 2).sum())
+        np.testing.assert_allclose(found.drift[i], drift, rtol=1e-5)
+        assert float(found.wrong[i]) == float(drift >= other)
+        reach = np.sqrt((((ahead[i] - here) / scale) ** 2).sum())
+        np.testing.assert_allclose(found.reach[i], reach, rtol=1e-5)
+
+
+def test_coverage_against_a_loop():
+    visited, predicted = RNG.normal(size=(7, 3)), RNG.normal(size=(4, 5, 3))
+    valid = RNG.random((4, 5)) < 0.7
+    valid[0, 0] = True
+    found = horizon.coverage(*map(jnp.asarray, (visited, predicted, valid)), jnp.ones(3))
+    for most in range(1, 6):
+        total = 0.0
+        for state in visited:
+            total += min(
+                np.linalg.norm(predicted[k, i] - state)
+                for k in range(4)
+                for i in range(most)
+                if valid[k, i]
+            )
+        np.testing.assert_allclose(found[most - 1], total / 7, rtol=1e-5)
+    assert np.all(np.diff(found) <= 1e-6)
+
+
+def test_moving_means_are_means_of_what_was_seen():
+    state = horizon.init_horizon(3)
+    wrong, valid = RNG.random((20, 3)) < 0.5, RNG.random((20, 3)) < 0.6
+    for row, seen in zip(wrong, valid, strict=True):
+        measured = horizon.Measured(jnp.asarray(row, jnp.float32), jnp.zeros(3), jnp.ones(3))
+        state = horizon.add(state, measured, jnp.asarray(seen))
+    for i in range(3):
+        np.testing.assert_allclose(state.wrong[i], wrong[valid[:, i], i].mean(), rtol=1e-5)
+    np.testing.assert_allclose(state.reach, 1.0)  # also of what had ended: it stays there
+
+
+def test_the_choice_follows_the_labels():
+    reach = jnp.arange(1.0, 11.0)
+    for first_wrong in (1, 4, 10):
+        wrong = (jnp.arange(10) >= first_wrong).astype(jnp.float32)
+        chosen = horizon.choose(horizon.Horizon(jnp.ones(10), wrong, reach), 10)
+        assert int(chosen) == first_wrong
+    right = horizon.Horizon(jnp.ones(10), jnp.zeros(10), reach)
+    assert int(horizon.choose(right, 6)) == 6  # never above the bound
+    assert int(horizon.choose(horizon.init_horizon(10), 10)) == 1
+
+
+def test_it_is_chosen_while_training():
+    """Here the expert says the same everywhere: every label is right, so L is the most."""
+    config, hparams = probe_settings(
+        "ppl", adaptive_horizon=True, max_preference_horizon=6, total_steps=400
+    )
+    functions = make_train(Probe(), Probe.scripted_expert, make(), config)
+    run = jax.jit(functions.run_chunk, static_argnums=1)
+    learner = functions.init(jax.random.key(0), hparams.replace(preference_horizon=6))
+    learner, metrics = run(learner, 40)
+    assert int(learner.counters.human_data) > 0
+    assert float(jnp.max(learner.algorithm.horizon.wrong)) == 0
+    assert int(horizon.choose(learner.algorithm.horizon, 6)) == 6
+    assert 1 <= float(metrics["train/preference_horizon"]) <= 6
+
+
+def make():
+    from ppl_jax import algorithms
+
+    return algorithms.method("ppl").make
