@@ -431,6 +431,26 @@ class Expert:
 
 
 @dataclasses.dataclass
+class Horizon:
+    """Measure along runs of ppl what a longer preference horizon buys and costs."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    seeds: int = 3
+    """Seeds 0, 1, ..., one run each."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    measure_every: int | None = None
+    """Steps between measurements (default: a fifth of the run)."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    expert: str = "scripted"
+    """scripted, neural (the shipped one), or a policy file or run folder."""
+    out: Path = Path("horizon.csv")
+    """File to write."""
+
+
+@dataclasses.dataclass
 class Table:
     """Print results as a table: Markdown, LaTeX or plain."""
 
@@ -456,10 +476,12 @@ class Figure:
     """Folder of ppl sweep, compare or ablation, its results.csv, a folder of experts' cards, or
     (kind steering) a run folder or policy file."""
     other: Positional[tuple[Path, ...]] = ()
-    """Kind steering: more of them."""
-    kind: Literal["curves", "axis", "heatmap", "training", "experts", "steering"] | None = None
+    """Kind steering: more of them; kind horizon: results over L, to show beside."""
+    kind: (
+        Literal["curves", "axis", "heatmap", "training", "experts", "steering", "horizon"] | None
+    ) = None
     """Learning curves; success over one setting, or two; takeovers and cost in training; training
-    of experts; steering on one map (default: what the results have)."""
+    of experts; steering on one map; what L buys and costs (default: what the results have)."""
     column: Literal["success", "progress", "episodic_return", "episodic_cost"] = "success"
     """What is drawn."""
     steps: tuple[int, ...] = ()
@@ -526,6 +548,7 @@ Command = (
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Robustness, subcommand("robustness")]
+    | Annotated[Horizon, subcommand("horizon")]
     | Annotated[Table, subcommand("table")]
     | Annotated[Figure, subcommand("figure")]
     | Annotated[Expert, subcommand("expert")]
@@ -662,6 +685,15 @@ def _sweep(command: Sweep) -> None:
     sweep(command)
 
 
+def _horizon(command: Horizon) -> None:
+    from experiments.horizon import measure_horizon
+    from experiments.runtime import start_jax
+
+    start_jax()
+    measure_horizon(command)
+    print(f"wrote {command.out}")
+
+
 def _table(command: Table) -> None:
     from experiments.report import table
 
@@ -777,6 +809,7 @@ _ACTIONS = {
     Tune: _tune,
     Sweep: _sweep,
     Robustness: _sweep,
+    Horizon: _horizon,
     Table: _table,
     Figure: _figure,
     Expert: _expert,

@@ -9,21 +9,29 @@ measured at the i-th predicted state s~_i of an intervention at s is
     drift_i = |h(s~_i) - a_h|                          how far its answer has moved
     reach_i = |s~_i - s|, in the world's units         how far the prediction has come from s
 
-`preference_horizon="auto"` keeps moving means of wrong and reach while it trains and takes the L
-that minimises the sum of both errors, each as a share of its worst:
+`preference_horizon="auto"` keeps moving means of drift, reach and |a_h - a_n| while it trains and
+takes the L that balances both errors, each as a share of its worst:
 
-    gap(L) + error(L),  gap(L) = 1 - reach_L / reach_M,  error(L) = 2 mean_{i <= L} wrong_i
+    min over L of max(gap(L), error(L)),   gap(L)   = 1 - reach_L / reach_M
+                                           error(L) = drift_L / |a_h - a_n|
 
-(labels that are wrong half the time teach nothing: error 1; M is the longest horizon allowed).
+M is the longest horizon allowed. An error of 1 is a pair whose preferred action is as far from what
+the expert would do there as the novice's action was from the expert's to begin with.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.intervention import COMPARING, RULES
+from ppl_jax.predictor import Act, predict, selected_transition
+from ppl_jax.types import Env, Expert
 
 MEMORY = 500  # predicted trajectories that the moving means look back
 
@@ -35,11 +43,13 @@ class Measured(NamedTuple):
         wrong: 0 or 1.
         drift: In units of the action.
         reach: In units of the world's observation scale.
+        apart: |a_h - a_n|, [...].
     """
 
     wrong: jax.Array
     drift: jax.Array
     reach: jax.Array
+    apart: jax.Array
 
 
 def measure(
@@ -62,7 +72,8 @@ def measure(
     drift = jnp.linalg.norm(advice - expert_action, axis=-1)
     other = jnp.linalg.norm(advice - novice_action, axis=-1)
     reach = jnp.linalg.norm((predicted - observation) / scale, axis=-1)
-    return Measured((drift >= other).astype(jnp.float32), drift, reach)
+    apart = jnp.linalg.norm(expert_action - novice_action)
+    return Measured((drift >= other).astype(jnp.float32), drift, reach, apart)
 
 
 def coverage(
@@ -91,17 +102,19 @@ class Horizon:
 
     Attributes:
         count: Predicted steps seen, by step.
-        wrong, reach: As in `Measured`.
+        drift, reach: As in `Measured`.
+        apart: The same, scalar.
     """
 
     count: jax.Array
-    wrong: jax.Array
+    drift: jax.Array
     reach: jax.Array
+    apart: jax.Array
 
 
 def init_horizon(steps: int) -> Horizon:
     """Nothing seen yet."""
-    return Horizon(jnp.zeros(steps), jnp.zeros(steps), jnp.zeros(steps))
+    return Horizon(jnp.zeros(steps), jnp.zeros(steps), jnp.zeros(steps), jnp.zeros(()))
 
 
 def add(horizon: Horizon, measured: Measured, valid: jax.Array) -> Horizon:
@@ -113,21 +126,132 @@ def add(horizon: Horizon, measured: Measured, valid: jax.Array) -> Horizon:
     rate = jnp.where(valid, 1.0 / jnp.clip(count, 1.0, MEMORY), 0.0)
     return Horizon(
         count,
-        horizon.wrong + rate * (measured.wrong - horizon.wrong),
+        horizon.drift + rate * (measured.drift - horizon.drift),
         horizon.reach + rate[0] * (measured.reach - horizon.reach),
+        horizon.apart + rate[0] * (measured.apart - horizon.apart),
     )
 
 
-def errors(horizon: Horizon) -> tuple[jax.Array, jax.Array]:
-    """gap(L) and error(L) for L = 1..M, [M] each; steps never seen reach as far as the last."""
-    reach = jax.lax.cummax(horizon.reach)
+def errors(
+    drift: jax.Array, reach: jax.Array, apart: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """gap(L) and error(L) for L = 1..M, [M] each."""
+    reach = jax.lax.cummax(reach)
     gap = 1.0 - reach / jnp.maximum(reach[-1], 1e-9)
-    steps = jnp.arange(1, reach.shape[0] + 1)
-    return gap, 2.0 * jnp.cumsum(horizon.wrong) / steps
+    return gap, drift / jnp.maximum(apart, 1e-9)
 
 
 def choose(horizon: Horizon, most: jax.Array | float) -> jax.Array:
-    """The L from 1 to `most` with the least gap(L) + error(L); 1 before anything was seen."""
-    gap, error = errors(horizon)
-    allowed = jnp.arange(1, gap.shape[0] + 1) <= most
-    return 1.0 + jnp.argmin(jnp.where(allowed, gap + error, jnp.inf))
+    """The L from 1 to `most` whose larger error is least; 1 before anything was seen."""
+    worse = jnp.maximum(*errors(horizon.drift, horizon.reach, horizon.apart))
+    allowed = jnp.arange(1, worse.shape[0] + 1) <= most
+    return 1.0 + jnp.argmin(jnp.where(allowed, worse, jnp.inf))
+
+
+class Profile(NamedTuple):
+    """What `make_profile` measures, means over interventions; [M] unless said otherwise.
+
+    Attributes:
+        wrong, drift, reach: As in `Measured`.
+        apart: The same, scalar.
+        coverage: See `coverage`.
+        interventions: How many there were, scalar.
+    """
+
+    wrong: jax.Array
+    drift: jax.Array
+    reach: jax.Array
+    apart: jax.Array
+    coverage: jax.Array
+    interventions: jax.Array
+
+
+def make_profile(
+    env: Env,
+    expert: Expert,
+    config: TrainConfig,
+    worlds: int = 8,
+    steps: int = 500,
+    visited: int = 500,
+    kept: int = 500,
+) -> Callable[[jax.Array, Act, HParams], Profile]:
+    """`profile(key, act, hparams)`: what preferences at predicted states would be worth now.
+
+    The novice alone plays training scenarios. Where the gate would hand over, its action is
+    predicted `config.max_preference_horizon` steps ahead and the expert asked at every one.
+
+    Args:
+        env: The world.
+        expert: Asked; it never acts.
+        config: Gate, predictor and horizons.
+        worlds, steps: Played side by side, and for how long.
+        visited, kept: States and interventions that `coverage` is computed from.
+
+    Raises:
+        ValueError: If the gate is one that compares with the expert's own prediction.
+    """
+    if config.gate not in RULES or config.gate in COMPARING:
+        raise ValueError(f"gate must judge a prediction by itself, got {config.gate!r}")
+    transition, rule = selected_transition(env, config.predictor), RULES[config.gate]
+    params, scale = env.default_params, jnp.asarray(env.spec.observation_scale)
+    ahead = max(config.prediction_horizon, config.max_preference_horizon)
+    most = config.max_preference_horizon
+
+    def profile(key: jax.Array, act: Act, hparams: HParams) -> Profile:
+        def step(carry: Any, _: None) -> Any:
+            key, observation, state = carry
+            key, key_expert, key_ahead, key_step = jax.random.split(key, 4)
+            novice, wanted = act(observation), expert(key_expert, state, observation, params)
+            held = jnp.clip(novice, -1.0, 1.0)
+            found = predict(
+                env,
+                transition,
+                key_ahead,
+                state,
+                held,
+                params,
+                ahead,
+                observe=True,
+                advisor=expert,
+            )
+            judged = jax.tree.map(lambda leaf: leaf[: config.prediction_horizon], found)
+            takeover = rule(judged, None, hparams, scale)
+            states, advice, valid = (
+                leaf[:most] for leaf in (found.observation, found.advice, found.valid)
+            )
+            measured = measure(observation, states, advice, wanted, novice, scale)
+            observation_after, state, *_ = env.step(key_step, state, held, params)
+            row = (observation, states, measured, takeover & valid)
+            return (key, observation_after, state), row
+
+        def lane(key: jax.Array) -> Any:
+            key, key_reset = jax.random.split(key)
+            start = (key, *env.reset(key_reset, params))
+            return jax.lax.scan(step, start, None, length=steps)[1]
+
+        key, key_visited, key_kept = jax.random.split(key, 3)
+        rows = jax.vmap(lane)(jax.random.split(key, worlds))
+        seen, states, measured, valid = jax.tree.map(
+            lambda leaf: jnp.reshape(leaf, (worlds * steps, *leaf.shape[2:])), rows
+        )
+        count = jnp.maximum(jnp.sum(valid, 0), 1)
+        begun = valid[:, :1]
+
+        def mean(values: jax.Array, of: jax.Array) -> jax.Array:
+            return jnp.sum(jnp.where(of, values, 0.0), 0) / jnp.maximum(jnp.sum(of, 0), 1)
+
+        # a fixed number of interventions, drawn among those that there are
+        share = begun[:, 0] / jnp.maximum(jnp.sum(begun), 1)
+        some = jnp.where(jnp.sum(begun) > 0, share, 1.0 / share.shape[0])
+        chosen = jax.random.choice(key_kept, share.shape[0], (kept,), p=some)
+        at = jax.random.randint(key_visited, (visited,), 0, seen.shape[0])
+        return Profile(
+            wrong=mean(measured.wrong, valid),
+            drift=mean(measured.drift, valid),
+            reach=mean(measured.reach, begun),
+            apart=mean(measured.apart, begun[:, 0]),
+            coverage=coverage(seen[at], states[chosen], valid[chosen], scale),
+            interventions=count[0],
+        )
+
+    return profile

@@ -1,4 +1,4 @@
-"""What L buys and costs: the measurements against loops, and the choice on a world that is known."""
+"""What L buys and costs: measurements against loops, and the choice where the answer is known."""
 
 import jax
 import jax.numpy as jnp
@@ -45,23 +45,28 @@ def test_coverage_against_a_loop():
 
 def test_moving_means_are_means_of_what_was_seen():
     state = horizon.init_horizon(3)
-    wrong, valid = RNG.random((20, 3)) < 0.5, RNG.random((20, 3)) < 0.6
-    for row, seen in zip(wrong, valid, strict=True):
-        measured = horizon.Measured(jnp.asarray(row, jnp.float32), jnp.zeros(3), jnp.ones(3))
+    drift, valid = RNG.random((20, 3)), RNG.random((20, 3)) < 0.6
+    valid[:, 0] = True
+    for row, seen in zip(drift, valid, strict=True):
+        measured = horizon.Measured(jnp.zeros(3), jnp.asarray(row), jnp.ones(3), jnp.float32(0.5))
         state = horizon.add(state, measured, jnp.asarray(seen))
     for i in range(3):
-        np.testing.assert_allclose(state.wrong[i], wrong[valid[:, i], i].mean(), rtol=1e-5)
+        np.testing.assert_allclose(state.drift[i], drift[valid[:, i], i].mean(), rtol=1e-5)
     np.testing.assert_allclose(state.reach, 1.0)  # also of what had ended: it stays there
+    np.testing.assert_allclose(state.apart, 0.5)
 
 
-def test_the_choice_follows_the_labels():
-    reach = jnp.arange(1.0, 11.0)
-    for first_wrong in (1, 4, 10):
-        wrong = (jnp.arange(10) >= first_wrong).astype(jnp.float32)
-        chosen = horizon.choose(horizon.Horizon(jnp.ones(10), wrong, reach), 10)
-        assert int(chosen) == first_wrong
-    right = horizon.Horizon(jnp.ones(10), jnp.zeros(10), reach)
-    assert int(horizon.choose(right, 6)) == 6  # never above the bound
+def test_the_choice_balances_both_errors():
+    steps = jnp.arange(1.0, 11.0)
+
+    def chosen(drift, most=10):
+        return int(horizon.choose(horizon.Horizon(steps, drift, steps, jnp.float32(1.0)), most))
+
+    assert chosen(0.0 * steps) == 10  # the expert says the same everywhere
+    assert chosen(0.0 * steps, 6) == 6  # never above the bound
+    assert chosen(0.1 * steps) == 5  # gap 0.5 and error 0.5
+    assert chosen(0.25 * steps) == 3  # gap 0.7, error 0.75; at 2: 0.8 and 0.5
+    assert chosen(1.0 + 0.0 * steps) == 1  # no label is worth anything
     assert int(horizon.choose(horizon.init_horizon(10), 10)) == 1
 
 
@@ -75,7 +80,7 @@ def test_it_is_chosen_while_training():
     learner = functions.init(jax.random.key(0), hparams.replace(preference_horizon=6))
     learner, metrics = run(learner, 40)
     assert int(learner.counters.human_data) > 0
-    assert float(jnp.max(learner.algorithm.horizon.wrong)) == 0
+    assert float(jnp.max(learner.algorithm.horizon.drift)) < 1e-6
     assert int(horizon.choose(learner.algorithm.horizon, 6)) == 6
     assert 1 <= float(metrics["train/preference_horizon"]) <= 6
 
