@@ -51,8 +51,11 @@ def figure(command: Figure) -> None:
 
         steering([command.results, *command.other], command.scenario, command.out)
         return
+    if command.kind == "horizon":
+        what_horizons_cost(command.results, command.other, command.out)
+        return
     if command.other:
-        raise UserError("more than one path is for --kind steering alone")
+        raise UserError("more than one path is for --kind steering and horizon alone")
     cards = command.results.is_dir() and bool(list(command.results.glob("*.npz")))
     if command.kind == "experts" or (command.kind is None and cards):
         expert_curves(command.results, command.out)
@@ -247,6 +250,91 @@ def training(points: Sequence[Point], out: Path) -> None:
     cost.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     caption = "Between evaluations; means with 95% bootstrap intervals over seeds, "
     _finish(picture, f"{caption}{_seeds(points)}.", out)
+
+
+def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> None:
+    """What a longer preference horizon L buys and costs, and the success that it led to.
+
+    Args:
+        measured: A file of `ppl horizon`.
+        results: Results over L of the same world, or none.
+        out: Picture to write.
+
+    Raises:
+        UserError: If the files are others.
+    """
+    try:
+        with open(measured, newline="") as file:
+            rows = [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
+    except OSError as error:
+        raise UserError(str(error)) from error
+    if not rows or "predicted_step" not in rows[0]:
+        raise UserError(f"{str(measured)!r} is no file of `ppl horizon`")
+    stops = sorted({row["step"] for row in rows})
+    at = sorted({row["predicted_step"] for row in rows})
+    seeds = len({row["seed"] for row in rows})
+    picture, (panels,) = _canvas(1, 3 + bool(results), (4.2 * (3 + bool(results)), 4.4))
+
+    def mean(column: str, stop: float) -> np.ndarray:
+        return np.array(
+            [
+                np.mean([r[column] for r in rows if (r["predicted_step"], r["step"]) == (i, stop)])
+                for i in at
+            ]
+        )
+
+    for i, stop in enumerate(stops):
+        style = _style(i) | {"label": f"after {stop:,.0f} steps"}
+        panels[0].plot(at, mean("drift", stop), **style)
+        panels[1].plot(at, mean("coverage", stop), **style)
+    gap, error = (np.mean([mean(c, stop) for stop in stops], 0) for c in ("gap", "error"))
+    panels[2].plot(at, gap, **_style(0), label="gap(L)")
+    panels[2].plot(at, error, **_style(1), label="error(L)")
+    best = at[int(np.argmin(np.maximum(gap, error)))]
+    panels[2].axvline(best, color="black", linewidth=0.8, linestyle=":")
+    panels[2].set(xlabel="preference horizon L (steps)", title=f"balanced at L = {best:.0f}")
+    panels[0].set(xlabel="predicted step i", title="how far the expert's action drifts")
+    panels[0].set_ylabel("|h(s_i) - a_h|, units of the action")
+    panels[1].set(xlabel="preference horizon L (steps)", title="states visited, states preferred")
+    panels[1].set_ylabel("mean distance to the nearest, scaled observation")
+    panels[2].set_ylabel("share of its worst")
+    for column, _ in enumerate(results):
+        points = read_points(results[column])
+        for i, step in enumerate(sorted({point.step for point in points})):
+            here = [p for p in points if p.step == step and _is_number(p, "preference_horizon")]
+            if not here:
+                continue
+            x = [float(p.values["preference_horizon"]) for p in here]
+            found = [p.interval("success") for p in here]
+            middle, low, high = (np.array(part) for part in zip(*found, strict=True))
+            bars = [middle - low, high - middle]
+            label = f"{here[0].algorithm}, {step:,} steps"
+            panels[3].errorbar(x, middle, bars, capsize=3, label=label, **_style(i))
+        panels[3].set(xlabel="preference horizon L (steps)", title="what it led to")
+        panels[3].set_ylabel(NAMES["success"])
+        panels[3].set_ylim(0, 1.02)
+    for axes in panels:
+        _plain(axes)
+        axes.legend(frameon=False, fontsize=8)
+        axes.set_xticks(at)
+        if axes is not panels[-1] or not results:
+            axes.set_ylim(bottom=0)
+    caption = (
+        f"Where the novice alone would be taken over; means over n = {seeds} seeds. gap(L) = 1 - "
+        "reach_L / reach_M; error(L) = drift_L / |a_h - a_n|. Success: 95% bootstrap intervals."
+    )
+    _finish(picture, caption, out)
+
+
+def _number(value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        return float("nan")
+
+
+def _is_number(point: Point, name: str) -> bool:
+    return not np.isnan(_number(point.values.get(name, "")))
 
 
 def expert_curves(folder: Path, out: Path) -> None:
