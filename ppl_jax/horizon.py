@@ -216,13 +216,14 @@ def make_profile(
             )
             judged = jax.tree.map(lambda leaf: leaf[: config.prediction_horizon], found)
             takeover = rule(judged, None, hparams, scale)
+            assert found.advice is not None  # an advisor was there
             states, advice, valid = (
                 leaf[:most] for leaf in (found.observation, found.advice, found.valid)
             )
             measured = measure(observation, states, advice, wanted, novice, scale)
-            observation_after, state, *_ = env.step(key_step, state, held, params)
+            after = env.step(key_step, state, held, params)
             row = (observation, states, measured, takeover & valid)
-            return (key, observation_after, state), row
+            return (key, *after[:2]), row
 
         def lane(key: jax.Array) -> Any:
             key, key_reset = jax.random.split(key)

@@ -84,12 +84,12 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
         learner, curves = functions.init(key, hparams), []
 
         def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, Curve]:
-            learner, _ = functions.run_chunk(learner, steps // interval)
+            learner = functions.run_chunk(learner, steps // interval)[0]
             return learner, look(learner, held_out)
 
         for phase, length in phases(config):
             if phase != "interact":
-                learner, _ = functions.run_chunk(learner, length // interval, phase)
+                learner = functions.run_chunk(learner, length // interval, phase)[0]
                 if phase == "fit":
                     curves.append(one(look(learner, held_out)))
                 continue
@@ -116,7 +116,7 @@ def make_batch(lane: Lane, side_by_side: bool) -> Callable[[jax.Array, HParams, 
         return jax.vmap(lane, in_axes=(0, 0, None))
 
     def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
-        return jax.lax.map(lambda run: lane(*run, held_out), (keys, hparams))
+        return jax.lax.map(lambda run: lane(run[0], run[1], held_out), (keys, hparams))
 
     return one_after_another
 
@@ -126,7 +126,7 @@ def stack(hparams: list[HParams]) -> HParams:
     return jax.tree.map(lambda *leaves: jnp.asarray(np.array(leaves, np.float32)), *hparams)
 
 
-def split(batch: PyTree, devices: list[jax.Device]) -> PyTree:
+def split(batch: PyTree, devices: list[Any]) -> PyTree:
     """A batch [B, ...] with its runs shared out over devices; B is a multiple of their number."""
     mesh = Mesh(np.array(devices), ("runs",))
     return jax.device_put(batch, NamedSharding(mesh, PartitionSpec("runs")))

@@ -89,3 +89,18 @@ def make():
     from ppl_jax import algorithms
 
     return algorithms.method("ppl").make
+
+
+def test_a_profile_of_a_world_that_is_known():
+    """The expert says the same at every predicted state of an episode: nothing drifts."""
+    config, hparams = probe_settings("ppl", max_preference_horizon=6)
+    profile = horizon.make_profile(Probe(), Probe.scripted_expert, config, 4, 60, 50, 20)
+    found = jax.jit(lambda key: profile(key, lambda observation: jnp.zeros(1), hparams))(
+        jax.random.key(0)
+    )
+    assert int(found.interventions) > 0
+    np.testing.assert_allclose(found.drift, 0, atol=1e-6)
+    np.testing.assert_allclose(found.wrong, 0)
+    np.testing.assert_allclose(found.apart, 0.6, atol=1e-6)  # of 0 and +-0.6
+    assert np.all(np.diff(found.reach) >= -1e-6)
+    assert np.all(np.diff(found.coverage) <= 1e-6)
