@@ -249,6 +249,8 @@ class ExpertTrain:
     """Steps that the scripted expert labels, under noise, and that the policy clones first."""
     demonstration_rounds: int | None = None
     """Rounds of these: the expert plays the first, the clone the others."""
+    cloning: Literal["laplace", "gaussian"] | None = None
+    """Likelihood that is cloned: for the median or the mean of what the expert does."""
     cloning_updates: int | None = None
     """Updates of that."""
     demonstration_noise: float | None = None

@@ -17,7 +17,7 @@ clipped too; the policy's updates of a batch stop at the first epoch whose diver
 policy that played exceeds `max_divergence`; where no episode ended, the multiplier stays; a policy
 that is `guided` also keeps to what an expert would do where it went,
 
-    + w E[ |mean - expert's action| ],    w: `guidance_weight`
+    - w E[ log pi(expert's action) ],    w: `guidance_weight`, log pi: `PPOConfig.cloning`
 
 as the demonstration-augmented gradient of Rajeswaran et al. (2018, "Learning Complex Dexterous
 Manipulation") keeps to demonstrations.
@@ -367,7 +367,7 @@ def make_ppo_lagrangian(
             away = gaussian_divergence(rows.mean, rows.log_std, mean, log_std)
             total = loss / (1 + multiplier) - hparams.entropy_weight * entropy
             if config.guided:
-                likely = log_likelihood(mean, rows.advice, "laplace")
+                likely = log_likelihood(mean, rows.advice, config.cloning)
                 total = total - hparams.guidance_weight * jnp.mean(likely)
             return total, jnp.mean(away)
 
@@ -492,7 +492,7 @@ def make_ppo_lagrangian(
 
                 def loss(network: Any) -> jax.Array:
                     mean = policy.apply(network["mean"], seen)
-                    return -jnp.mean(log_likelihood(mean, action, "laplace"))
+                    return -jnp.mean(log_likelihood(mean, action, config.cloning))
 
                 value, grads = jax.value_and_grad(loss)(learned.params)
                 return adam_step(learned, grads, CLONING_RATE * (1.0 - progress)), value
