@@ -76,8 +76,8 @@ class PPOConfig:
             the policy clones first.
         demonstration_rounds: Into which these are split: the expert plays the first, the clone the
             others.
-        cloning: Likelihood that is cloned (see `ppl_jax.distributions`): "laplace" goes for the median
-            of what the expert does in states that look alike, "gaussian" for the mean.
+        cloning: Likelihood that is cloned (see `ppl_jax.distributions`): "laplace" goes for the
+            median of what the expert does in states that look alike, "gaussian" for the mean.
         cloning_updates: Updates of that, over all rounds.
         guided: The expert also says at every step of the training what it would do.
         critic_batches: Batches at the start in which only the critics learn.
