@@ -247,6 +247,8 @@ class ExpertTrain:
     """Inputs are scaled by running statistics, or by the world's constants."""
     demonstrations: int | None = None
     """Steps that the scripted expert labels, under noise, and that the policy clones first."""
+    demonstration_stride: int | None = None
+    """Of these every so many are kept."""
     demonstration_rounds: int | None = None
     """Rounds of these: the expert plays the first, the clone the others."""
     cloning: Literal["laplace", "gaussian"] | None = None

@@ -74,6 +74,8 @@ class PPOConfig:
             world's constants.
         demonstrations: Steps that an expert labels with what it would do, under noise, and that
             the policy clones first.
+        demonstration_stride: Of these every so many are kept: steps that follow each other look
+            alike, and what a clone lacks is situations.
         demonstration_rounds: Into which these are split: the expert plays the first, the clone the
             others.
         cloning: Likelihood that is cloned (see `ppl_jax.distributions`): "laplace" goes for the
@@ -91,6 +93,7 @@ class PPOConfig:
     hidden: tuple[int, ...] = (256, 256)
     scaling: Literal["running", "world"] = "running"
     demonstrations: int = 0
+    demonstration_stride: int = 1
     demonstration_rounds: int = 1
     cloning: Literal["laplace", "gaussian"] = "laplace"
     cloning_updates: int = 20_000
@@ -121,6 +124,7 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
         "epochs",
         "minibatches",
         "demonstration_rounds",
+        "demonstration_stride",
     ):
         if getattr(config, field) < 1:
             raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")

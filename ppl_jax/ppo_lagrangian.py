@@ -456,7 +456,8 @@ def make_ppo_lagrangian(
         would have done; the clone learns from all rounds so far (DAgger; Ross et al. 2011).
         """
         rounds = config.demonstration_rounds
-        length = -(-config.demonstrations // (config.worlds * rounds))
+        stride = config.demonstration_stride
+        length = -(-config.demonstrations // (config.worlds * rounds * stride))
         updates = config.cloning_updates // rounds
 
         def one_round(carry: Any, number: jax.Array) -> Any:
@@ -475,7 +476,11 @@ def make_ppo_lagrangian(
                 learner, row = step_worlds(key_step, learner, action + noise)
                 return learner, (observation, shown, row[3].success, row[2])
 
-            learner, (*pairs, success, done) = jax.lax.scan(show, learner, None, length=length)
+            def show_some(learner: PPOLearner, _: None) -> Any:
+                learner, (*pairs, success, done) = jax.lax.scan(show, learner, None, length=stride)
+                return learner, (*(x[0] for x in pairs), success, done)
+
+            learner, (*pairs, success, done) = jax.lax.scan(show_some, learner, None, length=length)
             inputs = inputs.add(jnp.reshape(pairs[0], (-1, size)))
             kept = [
                 jax.lax.dynamic_update_slice(to, jnp.reshape(x, (-1, x.shape[-1])), (at, 0))
