@@ -225,7 +225,8 @@ def test_cloning_demonstrations_comes_first():
 
 
 def test_in_later_rounds_the_clone_plays():
-    config = dataclasses.replace(TINY, demonstrations=2560, demonstration_rounds=4, scaling="world")
+    rounds = {"demonstration_rounds": 4, "demonstration_stride": 2}
+    config = dataclasses.replace(TINY, demonstrations=2560, scaling="world", **rounds)
     for updates, success in ((0, 0.0), (400, 1.0)):
         made, _, init = functions(Probe, dataclasses.replace(config, cloning_updates=updates))
         learner, metrics = jax.jit(made.clone)(
