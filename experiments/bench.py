@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import resource
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +30,7 @@ from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
 
 STEPS = 200  # environment steps per timed call
+SWEEP = 64  # runs
 CONTACT_STEPS = 60  # after which an arm's tool is in contact
 
 
@@ -47,7 +50,7 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     Args:
         repeats: Of each figure; medians are reported.
         parts: Of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds in
-            one program).
+            one program), "sweep".
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
@@ -65,6 +68,8 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     for name in algorithms.registered(variants=False):
         if "methods" in parts or "seeds" in parts:
             figures |= _method(env, name, repeats, "seeds" in parts)
+    if "sweep" in parts:
+        figures |= _sweep(repeats)
     unit = 1 if sys.platform == "darwin" else 1024
     figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
@@ -363,4 +368,32 @@ def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
         "plain_product_gflops": plain / 1e9,
         "update_over_plain_product": flops / seconds / plain,
         "update_share_of_step": seconds * 1e3 / train_ms,
+    }
+
+
+def _sweep(repeats: int) -> dict[str, float]:
+    """Wall time per run of a sweep of default runs, against runs of `ppl train` one by one.
+
+    Both from the command line, with the programs' caches as they are: Python's start, building the
+    world, compiling (or reading the cache) and evaluations are in both.
+    """
+    program = [sys.executable, "-m", "experiments.cli"]
+
+    def seconds(*words: str) -> float:
+        began = time.perf_counter()
+        subprocess.run([*program, *words], check=True, capture_output=True)
+        return time.perf_counter() - began
+
+    with tempfile.TemporaryDirectory() as folder:
+        alone = [
+            seconds("train", "driving", "--seed", str(seed), "--out", f"{folder}/run-{seed}")
+            for seed in range(repeats)
+        ]
+        whole = seconds("sweep", "driving", "--seeds", str(SWEEP), "--out", f"{folder}/sweep")
+    single = float(np.median(alone))
+    return {
+        "sweep_runs": SWEEP,
+        "single_run_s": single,
+        "sweep_s_per_run": whole / SWEEP,
+        "sweep_over_single_runs": whole / SWEEP / single,
     }

@@ -528,13 +528,14 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
-    parts: tuple[Literal["worlds", "training", "experts", "methods", "seeds"], ...] = (
+    parts: tuple[Literal["worlds", "training", "experts", "methods", "seeds", "sweep"], ...] = (
         "worlds",
         "training",
         "experts",
         "methods",
     )
-    """What to measure; seeds (methods, and five seeds of each in one program) takes long."""
+    """What to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
+    against single ones) take long."""
     out: Path | None = None
     """Also write the figures to this JSON file."""
 
