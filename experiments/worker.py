@@ -33,7 +33,8 @@ class Worker:
         except UserError as error:
             return {"error": str(error)}
         except Exception as error:
-            return {"error": f"{type(error).__name__}: {str(error).splitlines()[0:1]}"}
+            first = (str(error).splitlines() or [""])[0]
+            return {"error": f"{type(error).__name__}: {first}"}
 
     def _run(self, job: Job) -> Reply:
         import jax
