@@ -112,9 +112,8 @@ def sweep(command: Sweep) -> None:
     with Progress(len(runs), "runs", len(done)) as progress:
         progress.start()
         for number, reply in _engine(command, [job for job, _ in jobs], log):
-            progress.began += reply.get("compile_s", 0.0) / _workers(
-                command
-            )  # not for what is left
+            compiling = reply.get("compile_s", 0.0) / _workers(command)
+            progress.began += compiling  # says nothing of what is left
             for run, rows in _replies(reply, jobs[number], runs):
                 if isinstance(rows, str):
                     failed[run.name] = rows
