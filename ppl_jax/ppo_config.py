@@ -74,8 +74,9 @@ class PPOConfig:
             world's constants.
         demonstrations: Steps that an expert labels with what it would do, under noise, and that
             the policy clones first.
-        demonstration_stride: Of these every so many are kept: steps that follow each other look
-            alike, and what a clone lacks is situations.
+        demonstration_stride: Of so many steps of a world the one is kept at which the clone is
+            furthest from the expert: steps that follow each other look alike, and what a clone
+            lacks is situations.
         demonstration_rounds: Into which these are split: the expert plays the first, the clone the
             others.
         cloning: Likelihood that is cloned (see `ppl_jax.distributions`): "laplace" goes for the

@@ -474,11 +474,16 @@ def make_ppo_lagrangian(
                 )
                 learner = dataclasses.replace(learner, key=key)
                 learner, row = step_worlds(key_step, learner, action + noise)
-                return learner, (observation, shown, row[3].success, row[2])
+                apart = jnp.sum(jnp.abs(jnp.clip(own, -1.0, 1.0) - shown), -1)
+                return learner, (apart, observation, shown, row[3].success, row[2])
 
             def show_some(learner: PPOLearner, _: None) -> Any:
-                learner, (*pairs, success, done) = jax.lax.scan(show, learner, None, length=stride)
-                return learner, (*(x[0] for x in pairs), success, done)
+                learner, (apart, *pairs, success, done) = jax.lax.scan(
+                    show, learner, None, length=stride
+                )
+                most = jnp.argmax(apart, 0)[None, :, None]
+                pairs = (jnp.take_along_axis(x, most, 0)[0] for x in pairs)
+                return learner, (*pairs, success, done)
 
             learner, (*pairs, success, done) = jax.lax.scan(show_some, learner, None, length=length)
             inputs = inputs.add(jnp.reshape(pairs[0], (-1, size)))
