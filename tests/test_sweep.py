@@ -330,6 +330,8 @@ def test_a_worker_that_dies_loses_and_doubles_nothing(tmp_path):
     assert seeds == [str(seed) for seed in range(4) for _ in range(3)]
 
 
+# Ray forks to start its nodes and replaces the child at once; JAX, by then running, warns of forks
+@pytest.mark.filterwarnings("ignore:os.fork")
 def test_a_ray_cluster_that_loses_a_node_loses_and_doubles_nothing(tmp_path):
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
