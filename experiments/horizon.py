@@ -13,7 +13,8 @@ from experiments.train import build, check, maker
 from ppl_jax import experts
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.horizon import errors, make_profile
-from ppl_jax.training import Learner, make_train
+from ppl_jax.interaction import Learner
+from ppl_jax.training import make_train
 
 if TYPE_CHECKING:
     from experiments.cli import Horizon

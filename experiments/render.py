@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,25 +68,16 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
         place, picture = _arm(env)
     horizon = config.prediction_horizon
 
-    def positions(state: Any, policy: Expert, held: bool) -> jax.Array:
-        first = policy(key, state, env.observe(state, params), params)
-
-        def roll(state: Any, _: None):
-            action = first if held else policy(key, state, env.observe(state, params), params)
-            state, _ = env.transition(key, state, action, params)
-            return state, place(state)
-
-        return jax.lax.scan(roll, state, None, length=horizon)[1]
+    ahead = functools.partial(predict, env, env.transition, key, place=place)
 
     @jax.jit
     def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
-        trajectory = predict(env, env.transition, key, state, action, params, horizon)
+        novice = ahead(state, action, params, horizon)
+        expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
         after, outcome = env.transition(key, state, action, params)
-        takeover = rule(trajectory, None, hparams, env.spec.observation_scale)
-        novice = positions(state, act, held=True)
-        expert = positions(state, env.scripted_expert, held=False)
-        return after, outcome, novice, takeover, expert
+        takeover = rule(novice, None, hparams, env.spec.observation_scale)
+        return after, outcome, novice.position, takeover, expert.position
 
     frames = []
     for t in range(steps):

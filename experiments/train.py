@@ -30,10 +30,11 @@ from experiments.runtime import UserError, device, revision, versions
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import HParams, TrainConfig, validate
 from ppl_jax.experts import SavedPolicy
+from ppl_jax.interaction import Learner
 from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.networks import Layers
 from ppl_jax.runlog import POLICY, SUMMARY, RunFolder
-from ppl_jax.training import Learner, Phase, TrainFunctions, make_train, phases
+from ppl_jax.training import Phase, TrainFunctions, make_train, phases
 from ppl_jax.types import Env, Expert
 
 EVALUATE_EVERY = 1000  # steps

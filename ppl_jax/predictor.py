@@ -29,6 +29,7 @@ def predict(
     act: Act | None = None,
     expert: Expert | None = None,
     advisor: Expert | None = None,
+    place: Callable[[Any], jax.Array] | None = None,
 ) -> Trajectory:
     """Roll `horizon` steps from `state`.
 
@@ -46,6 +47,7 @@ def predict(
         act: Policy asked again at every predicted state (the released code's gate).
         expert: Expert asked at every predicted state, the first included; `action` is ignored.
         advisor: Expert that only says what it would do at every predicted state.
+        place: `place(state) -> position [P]`, to see where it goes.
     """
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Trajectory]:
@@ -71,6 +73,7 @@ def predict(
             terminated=alive & outcome.terminated,
             valid=alive,
             advice=advice,
+            position=None if place is None else place(after),
         )
         alive = alive & ~(outcome.terminated | outcome.truncated)
         return (after, action, alive), predicted

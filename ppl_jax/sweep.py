@@ -18,7 +18,8 @@ from ppl_jax import experts
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.evaluation import Episodes, make_evaluate
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.training import Counters, Learner, TrainFunctions, phases
+from ppl_jax.interaction import Counters, Learner
+from ppl_jax.training import TrainFunctions, phases
 from ppl_jax.types import Env, PyTree
 
 

@@ -15,63 +15,18 @@ import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
-from ppl_jax.config import HParams, TrainConfig, as_arrays
+from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.interaction import Learner, make_steps, summarise
 from ppl_jax.losses import Metrics
-from ppl_jax.predictor import add_noise, predict, selected_transition
-from ppl_jax.types import DecisionPoint, Env, Expert, Interaction, Trajectory
+from ppl_jax.predictor import predict, selected_transition
+from ppl_jax.types import DecisionPoint, Env, Expert
 
 PyTree = Any
 Phase = Literal["demonstrate", "fit", "interact"]
-
-
-@flax.struct.dataclass
-class Counters:
-    """Sums over a run (or, as differences, over a chunk).
-
-    Attributes:
-        steps: Environment steps.
-        human_data: Steps under the expert's control.
-        takeovers: Times the expert took control.
-        episodes, successes: Training episodes that ended, and with success.
-        cost: Sum of step costs while training.
-        broken: Episodes that ended because the physics broke down.
-    """
-
-    steps: jax.Array
-    human_data: jax.Array
-    takeovers: jax.Array
-    episodes: jax.Array
-    successes: jax.Array
-    cost: jax.Array
-    broken: jax.Array
-
-
-@flax.struct.dataclass
-class Learner:
-    """All of a run's state, one pytree: saving it whole makes resuming exact.
-
-    Attributes:
-        algorithm: The method's own state (parameters, optimiser, buffers).
-        env_state: The world.
-        takeover: The expert is in control.
-        key: Random key.
-        hparams: The run's hyper-parameters.
-        counters: `Counters`.
-        diverged: A loss was not finite: what was learned stays as it was before.
-    """
-
-    algorithm: PyTree
-    env_state: PyTree
-    takeover: jax.Array
-    key: jax.Array
-    hparams: HParams
-    counters: Counters
-    diverged: jax.Array
 
 
 class TrainFunctions(NamedTuple):
@@ -128,6 +83,7 @@ def make_train(
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
     transition = selected_transition(env, config.predictor)
+    init, propose, advise, interact, _, learn = make_steps(env, expert, algorithm, config, params)
     interval = config.decision_interval
     check_rounds(algorithm, config)
     density = getattr(expert, "log_density", None)
@@ -138,35 +94,6 @@ def make_train(
                 "or another gate"
             )
         density = lambda observation, action: jnp.nan  # noqa: E731
-
-    def init(key: jax.Array, hparams: HParams) -> Learner:
-        key, key_algorithm, key_env = jax.random.split(key, 3)
-        _, env_state = env.reset(key_env, params)
-        zero = jnp.zeros((), jnp.int32)
-        return Learner(
-            algorithm=algorithm.init(key_algorithm),
-            env_state=env_state,
-            takeover=jnp.zeros((), bool),
-            key=key,
-            hparams=as_arrays(hparams),
-            counters=Counters(zero, zero, zero, zero, zero, jnp.zeros(()), zero),
-            diverged=jnp.zeros((), bool),
-        )
-
-    def propose(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
-        key_act, key_guess = jax.random.split(key)
-        action = algorithm.act(learner.algorithm, key_act, observation)
-        if config.random_steps:
-            guess = jax.random.uniform(key_guess, action.shape, minval=-1.0, maxval=1.0)
-            action = jnp.where(learner.counters.steps < config.random_steps, guess, action)
-        return action
-
-    def advise(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
-        """The expert's action, with its noise."""
-        key_expert, key_noise = jax.random.split(key)
-        action = expert(key_expert, learner.env_state, observation, params)
-        noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
-        return jnp.clip(action + noise, -1.0, 1.0)
 
     def decide(learner: Learner, key: jax.Array) -> jax.Array:
         """Whether the expert takes the next block."""
@@ -197,114 +124,8 @@ def make_train(
         )
         return algorithm.decide(learner.algorithm, point, learner.hparams)
 
-    def ahead(
-        takeover: jax.Array, key: jax.Array, state: PyTree, action: jax.Array, params: PyTree
-    ) -> Trajectory:
-        def roll() -> Trajectory:
-            horizon = config.max_preference_horizon
-            return predict(
-                env,
-                transition,
-                key,
-                state,
-                action,
-                params,
-                horizon,
-                observe=True,
-                advisor=expert if config.adaptive_horizon else None,
-            )
-
-        def nothing() -> Trajectory:
-            return jax.tree.map(
-                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(roll)
-            )
-
-        return jax.lax.cond(takeover, roll, nothing)
-
-    if jax.default_backend() == "cpu":
-        # a batched cond makes every lane pay for the lookahead; one lane after another, only those
-        # whose expert is in control do (a core is as fast with one lane as with many)
-        ahead = jax.custom_batching.sequential_vmap(ahead)
-
-    def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
-        """The first predicted states, for the pairs; skipped while the novice is in control."""
-        key_predict, key_noise = jax.random.split(key)
-        trajectory = ahead(learner.takeover, key_predict, learner.env_state, action, params)
-        noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
-        return dataclasses.replace(trajectory, observation=noisy)
-
-    def interact(learner: Learner, started: jax.Array) -> Learner:
-        """One environment step: act and store."""
-        keys = jax.random.split(learner.key, 6)
-        key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
-        hparams, state = learner.hparams, learner.env_state
-        observation = env.observe(state, params)
-        novice_action = propose(learner, key_propose, observation)
-        expert_action = advise(learner, key_expert, observation)
-        takeover = learner.takeover
-        executed = jnp.where(takeover, expert_action, jnp.clip(novice_action, -1.0, 1.0))
-        if algorithm.uses_predictions:
-            predicted = look_ahead(learner, key_ahead, novice_action)
-        else:
-            empty = jnp.zeros((0,))
-            predicted = Trajectory(empty[:, None], empty, empty, *([empty.astype(bool)] * 4))
-        after, outcome = env.transition(key_env, state, executed, params)
-        interaction = Interaction(
-            observation=observation,
-            next_observation=env.observe(after, params),
-            novice_action=novice_action,
-            expert_action=expert_action,
-            executed_action=executed,
-            takeover=takeover,
-            takeover_start=takeover & started,
-            reward=outcome.reward,
-            cost=outcome.cost,
-            terminated=outcome.terminated,
-            truncated=outcome.truncated,
-            success=outcome.success,
-            predicted=predicted,
-        )
-        done = outcome.terminated | outcome.truncated
-        restarted = jax.lax.cond(
-            done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset
-        )
-        counters = learner.counters
-        counters = Counters(
-            steps=counters.steps + 1,
-            human_data=counters.human_data + takeover,
-            takeovers=counters.takeovers + (takeover & started),
-            episodes=counters.episodes + done,
-            successes=counters.successes + outcome.success,
-            cost=counters.cost + outcome.cost,
-            broken=counters.broken + outcome.broken,
-        )
-        # a takeover ends with its episode; the next decision waits for the grid
-        return dataclasses.replace(
-            learner,
-            algorithm=algorithm.store(learner.algorithm, interaction, hparams),
-            env_state=restarted,
-            takeover=takeover & ~done,
-            key=key,
-            counters=counters,
-        )
-
-    def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
-        """One update; where a loss is not finite, what was learned stays as it was."""
-        key, key_update = jax.random.split(learner.key)
-        before = learner.algorithm
-        updated, metrics = update(before, key_update, learner.hparams)
-        finite = jnp.all(
-            jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)])
-        )
-        diverged = learner.diverged | ~finite
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(diverged, old, new), updated.learned, before.learned
-        )
-        updated = dataclasses.replace(updated, learned=kept)
-        return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
-
     def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
-        learner = interact(learner, started)
+        learner, _ = interact(learner, started)
         if algorithm.update_every > 1:
             return learner, {}
         return learn(learner, algorithm.update)
@@ -325,7 +146,7 @@ def make_train(
     def demonstrated_step(learner: Learner, _: None) -> tuple[Learner, None]:
         started = ~learner.takeover  # at the start of an episode
         learner = dataclasses.replace(learner, takeover=jnp.ones((), bool))
-        return interact(learner, started), None
+        return interact(learner, started)[0], None
 
     def fitted(learner: Learner, _: None) -> tuple[Learner, Metrics]:
         return learn(learner, algorithm.fit or algorithm.update)
@@ -383,19 +204,3 @@ def check_rounds(algorithm: Algorithm, config: TrainConfig) -> None:
             f"total_steps less demonstrations must be a multiple of rollout_steps ({every}) for "
             f"{algorithm.name}, got {rest}"
         )
-
-
-def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
-    """Metrics of a chunk: mean losses, and what the counters say."""
-    spent = jax.tree.map(lambda new, old: new - old, after, before)
-    steps = jnp.maximum(spent.steps, 1)
-    metrics = {f"train/{name}": jnp.mean(value) for name, value in losses.items()}
-    return metrics | {
-        "train/human_data_usage": after.human_data,
-        "train/intervention_rate": spent.human_data / steps,
-        "train/takeovers": spent.takeovers,
-        "train/episodes": spent.episodes,
-        "train/success_rate": spent.successes / jnp.maximum(spent.episodes, 1),
-        "train/cost_per_step": spent.cost / steps,
-        "train/broken_episodes": spent.broken,
-    }

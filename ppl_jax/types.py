@@ -65,6 +65,7 @@ class Trajectory:
         unsafe, success, terminated: Booleans.
         valid: The step was made: the prediction had not ended before it.
         advice: [H, A] the expert's action at each predicted state, where it was asked, else None.
+        position: [H, P] where each predicted state is, where that was asked, else None.
     """
 
     observation: jax.Array
@@ -75,6 +76,7 @@ class Trajectory:
     terminated: jax.Array
     valid: jax.Array
     advice: jax.Array | None = None
+    position: jax.Array | None = None
 
 
 @flax.struct.dataclass

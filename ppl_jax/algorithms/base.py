@@ -36,6 +36,8 @@ class Algorithm(NamedTuple):
         uses_predictions: Whether `store` reads `interaction.predicted`.
         compares: Whether `decide` reads the expert's own prediction.
         update_every: Steps between updates: 1, or a multiple of `decision_interval`.
+        asks: Whether an expert decides when to take over; not so where the method's own rule does,
+            or nobody.
         fit: Update of the phase between demonstrations and the first step; `update` where None.
     """
 
@@ -49,6 +51,7 @@ class Algorithm(NamedTuple):
     uses_predictions: bool = False
     compares: bool = False
     update_every: int = 1
+    asks: bool = True
     fit: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]] | None = None
 
 

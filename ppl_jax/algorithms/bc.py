@@ -75,4 +75,5 @@ def make_cloner(name: str, spec: WorldSpec, config: TrainConfig, decide: Gate) -
     def policy_layers(state: ClonerState) -> Layers:
         return layers(state.learned.average)
 
-    return Algorithm(name, init, act, decide, store, update, policy_layers)
+    asks = decide is not never
+    return Algorithm(name, init, act, decide, store, update, policy_layers, asks=asks)

@@ -129,4 +129,4 @@ def make_ensemble_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: EnsembleState) -> Layers:
         return ensemble_layers(state.learned.average)
 
-    return Algorithm("ensemble_dagger", init, act, decide, store, update, policy_layers)
+    return Algorithm("ensemble_dagger", init, act, decide, store, update, policy_layers, asks=False)

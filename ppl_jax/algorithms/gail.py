@@ -243,5 +243,6 @@ def make_gail(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         update,
         policy_layers,
         update_every=config.rollout_steps,
+        asks=False,
         fit=fit,
     )

@@ -224,4 +224,6 @@ def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: ThriftyState) -> Layers:
         return ensemble_layers(state.learned.policies.average)
 
-    return Algorithm("thrifty_dagger", init, act, decide, store, update, policy_layers, fit=fit)
+    return Algorithm(
+        "thrifty_dagger", init, act, decide, store, update, policy_layers, fit=fit, asks=False
+    )
