@@ -79,37 +79,41 @@ class Scene:
     def __init__(self, scenario: Scenario):
         self.scenario = jax.tree.map(np.asarray, scenario)
         lanes = self.scenario.lanes
-        self.surfaces, self.lines = [], []
+        self.surfaces: list[np.ndarray] = []
+        pieces, owners, colors = [], [], []
+
+        def add(points: np.ndarray, lane: int, color: tuple[int, int, int], every: int) -> None:
+            found = np.stack([points[:-1], points[1:]], 1)[::every]
+            pieces.append(found)
+            owners.extend([lane] * len(found))
+            colors.extend([color] * len(found))
+
         for i in np.flatnonzero(lanes.width > 0):
             left, right = _lane_outline(lanes, i)
             self.surfaces.append(np.concatenate([left, right[::-1]]))
             inner, last = lanes.number[i] > 0, lanes.number[i] == lanes.road_size[i] - 1
-            self._add_line(left, i, LINE if inner else CENTER_LINE, dashed=inner)
+            add(left, i, LINE if inner else CENTER_LINE, every=3 if inner else 1)  # dashed
             if last:
-                self._add_line(right, i, LINE, dashed=False)
+                add(right, i, LINE, every=1)
+        lines = np.concatenate(pieces)
+        shown = np.flatnonzero(~self._covered(lines.mean(1), np.array(owners)))
+        self.lines = [(lines[k], colors[k]) for k in shown]
 
-    def _add_line(self, points: np.ndarray, lane: int, color, dashed: bool) -> None:
-        """Keep the pieces of a line that no other road covers (as in a junction)."""
+    def _covered(self, points: np.ndarray, owners: np.ndarray) -> np.ndarray:
+        """Whether points [N, 2] on lines of lanes [N] lie on another road (as in a junction)."""
         lanes = self.scenario.lanes
-        first = lane - lanes.number[lane]
+        first = (owners - lanes.number[owners])[:, None]
         index = np.arange(len(lanes.width))
-        same_road = (index >= first) & (index < first + lanes.road_size[lane])
-        middle = (points[:-1] + points[1:]) / 2
-        long, lateral = jax.tree.map(
-            np.asarray, _coordinates(lanes, middle[:, None].astype(np.float32))
-        )
-        covered = (
-            (lanes.width > 0)
-            & ~same_road
-            & (np.abs(lateral) < lanes.width / 2 - 0.2)
-            & (long > 0.2)
-            & (long < lanes.length - 0.2)
-        ).any(-1)
-        for k in np.flatnonzero(~covered):
-            if not dashed or k % 3 == 0:
-                self.lines.append((points[k : k + 2], color))
+        same_road = (index >= first) & (index < first + lanes.road_size[owners][:, None])
+        padded = np.zeros((-(-len(points) // _ROWS) * _ROWS, 1, 2), np.float32)
+        padded[: len(points), 0] = points
+        found = _coordinates(lanes, padded)
+        long, lateral = (np.asarray(x)[: len(points)] for x in found)
+        on = (np.abs(lateral) < lanes.width / 2 - 0.2) & (long > 0.2) & (long < lanes.length - 0.2)
+        return ((lanes.width > 0) & ~same_road & on).any(-1)
 
 
+_ROWS = 1024  # points are looked up so many at a time: few programs
 _coordinates = jax.jit(lane_coordinates)
 
 
