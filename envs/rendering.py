@@ -154,7 +154,7 @@ def draw(
         px, py = camera(np.array([x, y]))[0]
         r = max(radius * camera.scale, 2.0 * zoom)
         pen.ellipse((px - r, py - r, px + r, py + r), fill=OBJECT)
-    vehicles = np.asarray(_traffic_poses(scenario, state.traffic))
+    vehicles = np.asarray(traffic_poses(scenario, state.traffic))
     for pose, half, status in zip(
         vehicles, scenario.traffic.half, state.traffic.status, strict=True
     ):
@@ -173,7 +173,7 @@ def draw(
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
 
 
-_traffic_poses = jax.jit(traffic_model.poses)
+traffic_poses = jax.jit(traffic_model.poses)
 
 
 def _path(pen: Any, camera: Camera, start: np.ndarray, path: np.ndarray, color, zoom: int) -> None:

@@ -523,6 +523,78 @@ class Render:
 
 
 @dataclasses.dataclass
+class Play:
+    """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    algorithm: str = "ppl"
+    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
+    seed: int = 0
+    """Random seed."""
+    total_steps: int | None = None
+    """Steps of the session."""
+    preference_horizon: int | Literal["auto"] | None = None
+    """L: predicted states that get a preference pair."""
+    beta: float | None = None
+    """Temperature of the preference loss."""
+    learning_rate: float | None = None
+    """Of Adam."""
+    manual_episodes: int = 0
+    """So many episodes at the start are all yours."""
+    participant: str = ""
+    """Who you are in a study: at most 32 letters, digits, - and _."""
+    consent: Path | None = None
+    """Text file to agree to before anything starts."""
+    familiarisation: int = 0
+    """Successes in a row, driving alone, before it counts (the paper: 10)."""
+    questions: Path | None = None
+    """JSON file of questions asked after every episode."""
+    rate: float | None = None
+    """Steps per second (default: the world's own, 10 in driving and 20 for the arm)."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    expose: bool = False
+    """Allow a host that others on the network can reach."""
+    evaluate: bool = True
+    """Play the held-out scenarios at the end."""
+    out: Path | None = None
+    """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
+    resume: bool = False
+    """Go on with the session in --out."""
+
+
+@dataclasses.dataclass
+class Replay:
+    """Watch a recorded session in a browser."""
+
+    recording: Positional[Path]
+    """Run folder of `ppl play`, or an exported session."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    expose: bool = False
+    """Allow a host that others on the network can reach."""
+
+
+@dataclasses.dataclass
+class Recording:
+    """Write a session of `ppl play` as one file that NumPy (or Minari) can read."""
+
+    run: Positional[Path]
+    """Run folder."""
+    out: Path = Path("session.npz")
+    """File to write."""
+    minari: str | None = None
+    """Write a Minari data set of this name instead, such as driving/person-v0."""
+
+
+@dataclasses.dataclass
 class Bench:
     """Measure speed, as ratios within one run."""
 
@@ -559,6 +631,9 @@ Command = (
     | Annotated[Expert, subcommand("expert")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[Play, subcommand("play")]
+    | Annotated[Replay, subcommand("replay")]
+    | Annotated[Recording, subcommand("recording")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Doctor, subcommand("doctor")]
 )
@@ -632,9 +707,7 @@ def _train(command: Train) -> None:
     check(settings)
     if command.resume and command.out is None:
         raise UserError("--resume needs --out, the run folder to go on with")
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{command.env}-{command.algorithm}-{command.seed}-{stamp}"
-    out = command.out or Path("runs") / name
+    out = command.out or _new_folder(command)
     start_jax()
     train(settings, out, command.resume)
     print_run(out)
@@ -792,6 +865,65 @@ def _render(command: Render) -> None:
     print(f"wrote {command.out}")
 
 
+def _play(command: Play) -> None:
+    from experiments.runtime import start_jax
+    from experiments.ui.play import play, read_consent, read_questions
+    from experiments.ui.session import Sitting
+    from experiments.ui.views import RATES
+
+    shared = {f.name for f in dataclasses.fields(Train)}
+    given = {name: v for name, v in dataclasses.asdict(command).items() if name in shared}
+    settings = run_settings(Train(**given, expert="person"))
+    rate = command.rate or RATES.get(command.env, 10.0)
+    if not 0.1 <= rate <= 1000:
+        raise UserError(f"rate must lie between 0.1 and 1000, got {rate}")
+    if command.resume and command.out is None:
+        raise UserError("--resume needs --out, the run folder to go on with")
+    sitting = Sitting(
+        rate=rate,
+        participant=command.participant,
+        consent=None if command.consent is None else read_consent(command.consent),
+        familiarisation=command.familiarisation,
+        questions=() if command.questions is None else read_questions(command.questions),
+        evaluate=command.evaluate,
+    )
+    start_jax()
+    play(
+        settings,
+        command.out or _new_folder(command),
+        command.resume,
+        sitting,
+        command.manual_episodes,
+        command.host,
+        command.port,
+        command.expose,
+    )
+
+
+def _new_folder(command: Train | Play) -> Path:
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return Path("runs") / f"{command.env}-{command.algorithm}-{command.seed}-{stamp}"
+
+
+def _replay(command: Replay) -> None:
+    from experiments.runtime import start_jax
+    from experiments.ui.replay import replay
+
+    start_jax()
+    replay(command.recording, command.host, command.port, command.expose)
+
+
+def _recording(command: Recording) -> None:
+    from experiments.ui.recording import export, export_minari
+
+    if command.minari is not None:
+        steps = export_minari(command.run, command.minari)
+        print(f"wrote {steps} steps to the Minari data set {command.minari}")
+        return
+    steps = export(command.run, command.out)
+    print(f"wrote {steps} steps to {command.out}")
+
+
 def _bench(command: Bench) -> None:
     from experiments.bench import bench
     from experiments.runtime import start_jax
@@ -820,6 +952,9 @@ _ACTIONS = {
     Expert: _expert,
     Export: _export,
     Render: _render,
+    Play: _play,
+    Replay: _replay,
+    Recording: _recording,
     Bench: _bench,
     Doctor: _doctor,
 }

@@ -82,13 +82,22 @@ def choose_backend() -> None:
 class ArmScene:
     """A world ready to be drawn again and again."""
 
-    def __init__(self, env: Any, size: tuple[int, int] = (300, 400)):
+    def __init__(self, env: Any, size: tuple[int, int] = (300, 400), smooth: bool = True):
+        """Make the renderer, in the thread that is to draw.
+
+        Args:
+            env: The world.
+            size: Height and width, pixels.
+            smooth: Edges without steps; half of the time goes there where no GPU draws.
+        """
         choose_backend()
         import mujoco
 
         self.mujoco = mujoco
         self.twin: WipingTwin | NutTwin = make_twin(env)
         self.model, self.data = self.twin.arm.model, self.twin.arm.data
+        if not smooth:
+            self.model.vis.quality.offsamples = 0
         self.renderer = _renderer(mujoco, self.model, *size)
         self.camera = mujoco.MjvCamera()
         for field, value in _CAMERAS[env.name].items():

@@ -1,0 +1,243 @@
+"""How each world is shown: driving as shapes that the page draws, the arms as rendered frames.
+
+A view's `scene(state)` is sent when an episode starts, `frame(state, shown)` in every step; both
+are JSON. A picture, where the view makes them, follows as JPEG when it is ready.
+"""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from experiments.runtime import UserError
+from ppl_jax.types import Env
+
+RATES = {"driving": 10.0, "table_wiping": 20.0, "nut_assembly": 20.0}  # Hz, of the worlds
+PICTURE = (480, 640)  # height and width
+
+
+class Shown(NamedTuple):
+    """Predicted paths to show, [H, P], or None.
+
+    Attributes:
+        novice: Of the novice's held action, from where it was looked ahead.
+        fails: It is predicted to fail.
+        mine: Of the person's held action, from here.
+    """
+
+    novice: np.ndarray | None = None
+    fails: bool = False
+    mine: np.ndarray | None = None
+
+
+class View(Protocol):
+    """How a world is shown."""
+
+    actions: list[dict[str, Any]]
+
+    def place(self, state: Any) -> jax.Array:
+        """Where a state is, for predicted paths; pure."""
+        ...
+
+    def scene(self, state: Any) -> dict[str, Any]:
+        """What stays for an episode."""
+        ...
+
+    def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
+        """What changes."""
+        ...
+
+    def picture(self, number: int, state: Any, shown: Shown) -> None:
+        """Have a picture made, where the view makes any."""
+        ...
+
+    def close(self) -> None:
+        """Stop whatever makes pictures."""
+        ...
+
+
+Picture = Callable[[int, bytes], None]
+"""`picture(frame's number, JPEG)`."""
+
+
+def make_view(env: Env, picture: Picture) -> View:
+    """The view of a world.
+
+    Raises:
+        UserError: If the world has none.
+    """
+    if env.name == "driving":
+        return DrivingView(env)
+    if env.name in RATES:
+        return ArmView(env, picture)
+    raise UserError(f"{env.name} cannot be shown in a browser: choose {', '.join(RATES)}")
+
+
+def _rounded(values: Any, digits: int = 2) -> list[Any]:
+    return np.round(np.asarray(values, np.float64), digits).tolist()
+
+
+class DrivingView:
+    """The road from above."""
+
+    actions = [  # noqa: RUF012 - a constant
+        {"name": "steering", "negative": "right", "positive": "left"},
+        {"name": "pedals", "negative": "brake", "positive": "throttle"},
+    ]
+
+    def __init__(self, env: Any):
+        self.env = env
+
+    def place(self, state: Any) -> jax.Array:
+        """Centre of the ego, m."""
+        return state.ego.pose[:2]
+
+    def scene(self, state: Any) -> dict[str, Any]:
+        """Road surfaces, the route's among them, lines and what stands there."""
+        from envs.driving.scenario import take
+        from envs.rendering import CENTER_LINE, Scene
+
+        self.scenario = take(self.env.default_params.scenarios, int(state.scenario))
+        scene = Scene(self.scenario)
+        scenario = scene.scenario
+        lanes, objects = scenario.lanes, scenario.objects
+        there = np.flatnonzero(lanes.width > 0)
+        final = scene.surfaces[int(np.flatnonzero(there == int(scenario.final_lane))[0])]
+        near = np.abs(objects.circle[:, :2]).max(-1) < 1e5
+        return {
+            "number": int(scenario.number),
+            "roads": [_rounded(surface) for surface in scene.surfaces],
+            "route": [int(lanes.route[lane]) for lane in there],
+            "goal": _rounded(_end_of(final)),
+            "lines": [_rounded(np.ravel(line)) for line, color in scene.lines],
+            "middle": [int(color == CENTER_LINE) for _, color in scene.lines],
+            "cones": _rounded(objects.circle[near]),
+            "boxes": _rounded(objects.box_half),
+            "wrecks": np.asarray(objects.box_is_vehicle).astype(int).tolist(),
+            "cars": _rounded(scenario.traffic.half),
+        }
+
+    def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
+        """Poses of everything that moves."""
+        from envs.driving import traffic as traffic_model
+        from envs.rendering import traffic_poses
+
+        ego, speed = np.asarray(state.ego.pose), float(np.hypot(*np.asarray(state.ego.velocity)))
+        cars = np.asarray(traffic_poses(self.scenario, state.traffic))
+        status = np.asarray(state.traffic.status)
+        return {
+            "ego": _rounded(ego, 3),
+            "cars": [
+                None
+                if kind == traffic_model.REMOVED
+                else [*_rounded(pose), int(kind == traffic_model.PARKED)]
+                for pose, kind in zip(cars, status, strict=True)
+            ],
+            "boxes": _rounded(state.box_pose),
+            "novice": None if shown.novice is None else _rounded(shown.novice),
+            "fails": shown.fails,
+            "mine": None if shown.mine is None else _rounded(shown.mine),
+            "more": [["speed", f"{3.6 * speed:.0f} km/h"]],
+        }
+
+    def picture(self, number: int, state: Any, shown: Shown) -> None:
+        """None is made: the page draws."""
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+def _end_of(surface: np.ndarray) -> np.ndarray:
+    """Far end of a lane's outline: its two corners, [2, 2]."""
+    half = len(surface) // 2
+    return surface[[half - 1, half]]
+
+
+class ArmView:
+    """The arm, rendered in a process of its own, which draws the newest state when it can."""
+
+    def __init__(self, env: Any, picture: Picture):
+        self.env, self._picture = env, picture
+        names = ["x (away)", "y (left)", "z (up)", "turn about x", "turn about y", "turn about z"]
+        if env.spec.action_size == 7:
+            names.append("gripper")
+        self.actions = [{"name": name, "negative": "-", "positive": "+"} for name in names]
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_paint, args=(theirs, env.name), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def place(self, state: Any) -> jax.Array:
+        """The grip site, m."""
+        return self.env.grip_position(state)
+
+    def scene(self, state: Any) -> dict[str, Any]:
+        """The frames show everything."""
+        return {"number": int(state.scenario)}
+
+    def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
+        """A few figures beside the picture."""
+        more = []
+        if hasattr(state, "wiped"):
+            left = len(state.wiped) - int(np.asarray(state.wiped).sum())
+            more = [
+                ["dirt left", f"{left} of {len(state.wiped)}"],
+                ["touching", "yes" if bool(state.contact) else "no"],
+            ]
+        if hasattr(state, "touching"):
+            more = [["ring held", "yes" if bool(state.touching) else "no"]]
+        return {"fails": shown.fails, "more": more}
+
+    def picture(self, number: int, state: Any, shown: Shown) -> None:
+        """Hand the state over; the picture comes when it is ready."""
+        try:
+            self._pipe.send((number, jax.tree.map(np.array, state), shown))
+        except (BrokenPipeError, OSError):
+            return
+
+    def _read(self) -> None:
+        while True:
+            try:
+                number, jpeg = self._pipe.recv()
+            except (EOFError, OSError):
+                return
+            self._picture(number, jpeg)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        self._process.join(timeout=5)
+        self._pipe.close()
+
+
+def _paint(pipe: Any, name: str) -> None:
+    """Draw the newest state, again and again, until the other end is closed."""
+    import signal
+
+    from PIL import Image
+
+    from envs import make
+    from envs.manipulation.drawing import ArmPaths, ArmScene
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    scene = ArmScene(make(name), PICTURE, smooth=False)
+    while True:
+        try:
+            number, state, shown = pipe.recv()
+            while pipe.poll():
+                number, state, shown = pipe.recv()
+            pixels = scene.draw(state, ArmPaths(shown.novice, shown.fails, shown.mine))
+            out = io.BytesIO()
+            Image.fromarray(pixels).save(out, "JPEG", quality=80)
+            pipe.send((number, out.getvalue()))
+        except (EOFError, OSError):
+            return
