@@ -43,7 +43,7 @@ class Trainee:
     Attributes:
         env: The world.
         learner: All of the run's state.
-        events: Lines of the log so far.
+        events, steps: Lines of the log and steps so far.
         losses: Of the last update that was looked at.
         ahead: Where the novice was going when it was last looked at, every K steps; None before.
     """
@@ -76,7 +76,7 @@ class Trainee:
                 f"algorithm {settings.algorithm} asks nobody when to take over: choose ppl, pvp, "
                 "hg_dagger, iwr, eil or haco"
             )
-        self.events = 0
+        self.events = self.steps = 0
         self.losses: dict[str, float] = {}
         self.ahead: Foreseen | None = None
         self._since = 0  # steps of the episode
@@ -119,13 +119,13 @@ class Trainee:
         lines = _whole_lines(self.folder.path / LOG)
         done, self.learner = restore_learner(self.folder, self.learner)
         self.events = self._saved = done
+        self.steps = int(self.learner.counters.steps)
         self.recorder.rewind(done)
         if len(lines) > done:
             tell(f"going over {len(lines) - done} steps again")
         for line in lines[done:]:
             self._apply(line)
-        steps = int(self.learner.counters.steps)
-        self.folder.rewind(steps, steps)
+        self.folder.rewind(self.steps, self.steps)
 
     def _apply(self, line: dict[str, Any]) -> None:
         if line["do"] == "restart":
@@ -138,11 +138,6 @@ class Trainee:
     # what a session does with it
 
     @property
-    def steps(self) -> int:
-        """Steps so far."""
-        return int(self.learner.counters.steps)
-
-    @property
     def complete(self) -> bool:
         """The run is as long as it was to be."""
         return self.steps >= self.settings.config.total_steps
@@ -150,10 +145,9 @@ class Trainee:
     @property
     def manual(self) -> bool:
         """The person makes every step for now."""
-        counters = self.learner.counters
         return (
-            int(counters.steps) < self.settings.config.demonstrations
-            or int(counters.episodes) < self.manual_episodes
+            self.steps < self.settings.config.demonstrations
+            or int(self.learner.counters.episodes) < self.manual_episodes
         )
 
     def foresee(self, learner: Learner, action: np.ndarray) -> Foreseen:
@@ -189,7 +183,7 @@ class Trainee:
         step = jax.tree.map(np.asarray, step)
         assert self.ahead is not None
         self.recorder.add(step, state, self.ahead)
-        self._since += 1
+        self._since, self.steps = self._since + 1, self.steps + 1
         if step.terminated | step.truncated:
             self._since, self.ahead = 0, None
         return step
