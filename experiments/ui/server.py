@@ -318,6 +318,7 @@ def listen(host: str, port: int, exposed: bool) -> socket.socket:
     served.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         served.bind((host, port))
+        served.listen(64)  # whoever opens the address at once is kept waiting, not refused
     except (OSError, OverflowError) as error:
         served.close()
         raise UserError(f"port: cannot listen on {host}:{port} ({error})") from error
