@@ -356,7 +356,7 @@ def serve(
             failure.append(error)
         finally:
             over.set()
-            if failure or not performance.lingers:
+            if failure or not performance.lingers or seen.is_set():
                 server.should_exit = True
 
     def invite() -> None:
@@ -364,6 +364,7 @@ def serve(
             tell(f"open http://{shown}:{port}/?token={hub.new_token()}")
 
     def quit_after_the_end() -> None:
+        seen.set()
         if over.is_set():
             server.should_exit = True
 
@@ -378,7 +379,7 @@ def serve(
         performance.stop()
         await asyncio.to_thread(thread.join, 60)
 
-    over = threading.Event()
+    over, seen = threading.Event(), threading.Event()
     thread = threading.Thread(target=perform)
     app = make_app(hub, ["*"] if exposed else [*LOOPBACK, "[::1]"])
     app.router.lifespan_context = lifespan
