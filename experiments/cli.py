@@ -102,8 +102,9 @@ class Train:
     """Samples per loss and update."""
     predictor: Literal["simulator", "kinematic"] | None = None
     """The world's own transition, or the rule-based bicycle with traffic frozen."""
-    expert: str = "scripted"
-    """scripted, neural (the shipped one), or a policy file or run folder."""
+    expert: tuple[Literal["recorded"], str] | str = "scripted"
+    """scripted, neural (the shipped one), a policy file or run folder; or recorded PATH, a session
+    of `ppl play`."""
     scenarios: str | None = None
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
@@ -644,6 +645,7 @@ MOST_PAIRS = 10  # that preference_horizon "auto" may choose
 
 def run_settings(command: Train):
     """Turn the command line into settings of a run."""
+    from experiments.recorded import length_of, recording_of
     from experiments.train import RunSettings
     from ppl_jax.algorithms import settings
 
@@ -659,6 +661,12 @@ def run_settings(command: Train):
         static["adaptive_horizon"] = True
         longest = static.get("prediction_horizon", config.prediction_horizon)
         given["preference_horizon"] = max(1, min(MOST_PAIRS, longest))
+    expert = command.expert if isinstance(command.expert, str) else " ".join(command.expert)
+    if expert == "recorded":
+        raise UserError("expert recorded needs the session: --expert recorded PATH")
+    if (path := recording_of(expert)) is not None:
+        whole = length_of(path, command.env) // config.decision_interval
+        static.setdefault("total_steps", whole * config.decision_interval)
     if "total_steps" in static and "demonstrations" not in static:
         static["demonstrations"] = min(config.demonstrations, max(static["total_steps"], 0))
         if not static["demonstrations"]:
@@ -679,7 +687,7 @@ def run_settings(command: Train):
         seed=command.seed,
         config=final,
         hparams=hparams.replace(**traced),
-        expert=command.expert,
+        expert=expert,
         reference_policy=command.reference_policy,
         scenarios=command.scenarios,
         held_out_scenarios=command.held_out_scenarios,

@@ -26,6 +26,7 @@ from experiments.evaluate import (
 )
 from experiments.policy_file import save_policy
 from experiments.progress import Progress
+from experiments.recorded import recorded_functions, recording_of
 from experiments.runtime import UserError, device, revision, versions
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import HParams, TrainConfig, validate
@@ -47,7 +48,8 @@ class RunSettings:
     Attributes:
         env, algorithm, seed: What is trained.
         config, hparams: Static and traced settings.
-        expert: "scripted", "neural" (the shipped one), or a policy file.
+        expert: "scripted", "neural" (the shipped one), a policy file, "person" (see
+            `experiments.ui`) or "recorded PATH" of such a session.
         reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
         evaluate_on: "held_out" or (to choose settings by) "training".
@@ -142,13 +144,22 @@ def build(settings: RunSettings) -> tuple[Env, Expert]:
     Raises:
         UserError: If a scenario folder or the expert's file cannot be used.
     """
+    env = build_world(settings)
+    return env, named_expert(settings.expert, env)
+
+
+def build_world(settings: RunSettings) -> Env:
+    """The world of a run.
+
+    Raises:
+        UserError: If a scenario folder cannot be used.
+    """
     options = {
         name: value
         for name in ("scenarios", "held_out_scenarios")
         if (value := getattr(settings, name)) is not None
     }
-    env = make_world(settings.env, options)
-    return env, named_expert(settings.expert, env)
+    return make_world(settings.env, options)
 
 
 def maker(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
@@ -186,9 +197,8 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
     check(settings)
     folder = RunFolder(out)
     began = time.perf_counter()
-    env, expert = build(settings)
     try:
-        functions = make_train(env, expert, maker(settings, env), settings.config)
+        env, functions = _functions(settings)
     except ValueError as error:
         raise UserError(str(error)) from error
     every = functions.algorithm.update_every
@@ -217,6 +227,15 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             learner, note = runner.run(learner, chunk)
             progress.update(chunk.end, note)
     return runner.finish(learner, time.perf_counter() - began)
+
+
+def _functions(settings: RunSettings) -> tuple[Env, TrainFunctions]:
+    recording = recording_of(settings.expert)
+    if recording is None:
+        env, expert = build(settings)
+        return env, make_train(env, expert, maker(settings, env), settings.config)
+    env = build_world(settings)
+    return env, recorded_functions(env, maker(settings, env), settings.config, recording)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,9 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import envs
 from experiments.evaluate import read_evaluation
+from experiments.policy_file import load_policy
+from experiments.recorded import length_of
 from experiments.runtime import UserError
-from experiments.train import RunSettings, open_folder
+from experiments.train import RunSettings, open_folder, train
 from experiments.ui import recording
 from experiments.ui.protocol import (
     BURST,
@@ -407,3 +410,48 @@ def test_an_allowance_runs_out_and_comes_back():
     assert sum(allowance.take(0.0) for _ in range(2 * BURST)) == BURST
     assert not allowance.take(0.001)
     assert allowance.take(0.02)
+
+
+# learning from a recording
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    if not envs.known("probe"):
+        envs.register("probe", lambda **options: PROBE)
+    run = tmp_path_factory.mktemp("session") / "run"
+    Person(run).session.run()
+    return run
+
+
+def test_a_recording_teaches_what_the_session_taught(session, tmp_path):
+    settings = dataclasses.replace(SETTINGS, expert=f"recorded {session}", evaluate_every=100)
+    summary = train(settings, tmp_path / "run")
+    assert summary["success_rate"] == 1.0
+    first = json.loads((session / "summary.json").read_text())
+    assert summary["human_data_usage"] == first["human_data_usage"]
+    one, other = (load_policy(path / "policy.npz", 3, 1) for path in (session, tmp_path / "run"))
+    for (w, b), (v, c) in zip(one.weights, other.weights, strict=True):
+        np.testing.assert_allclose(w, v, atol=1e-4)
+        np.testing.assert_allclose(b, c, atol=1e-4)
+
+
+def test_a_recording_teaches_other_methods(session, tmp_path):
+    config = dataclasses.replace(CONFIG, demonstrations=300, offline_updates=500)
+    settings = dataclasses.replace(
+        SETTINGS, algorithm="bc", config=config, expert=f"recorded {session}"
+    )
+    assert train(settings, tmp_path / "bc")["success_rate"] == 1.0
+
+
+def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
+    settings = dataclasses.replace(SETTINGS, expert=f"recorded {session}")
+    longer = dataclasses.replace(CONFIG, total_steps=400)
+    with pytest.raises(UserError, match="total_steps must not exceed the recording's 300, got 400"):
+        train(dataclasses.replace(settings, config=longer), tmp_path / "run")
+    rounds = dataclasses.replace(CONFIG, rollout_steps=100)
+    with pytest.raises(UserError, match="gail plays by itself"):
+        train(dataclasses.replace(settings, algorithm="gail", config=rounds), tmp_path / "run")
+    with pytest.raises(UserError, match=r"is of probe, not of driving"):
+        length_of(session, "driving")
+    assert not (tmp_path / "run").exists()

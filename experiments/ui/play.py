@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.evaluate import make_world
 from experiments.runtime import UserError
-from experiments.train import RunSettings, check, open_folder
+from experiments.train import RunSettings, build_world, check, open_folder
 from experiments.ui.session import Question, Session, Sitting
 from experiments.ui.views import RATES
 from ppl_jax.runlog import RunFolder
@@ -53,7 +52,7 @@ def play(
 
     served = server.listen(host, port, exposed)
     with served:
-        env = make_world(settings.env, _options(settings))
+        env = build_world(settings)
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)
         try:
@@ -74,11 +73,6 @@ def play(
             )
         server.serve(hub, Session(trainee, view, sitting, hub.publish), served, exposed)
     print(f"the session is in {out}")
-
-
-def _options(settings: RunSettings) -> dict[str, Any]:
-    names = ("scenarios", "held_out_scenarios")
-    return {name: value for name in names if (value := getattr(settings, name)) is not None}
 
 
 def web() -> Any:
