@@ -19,6 +19,7 @@ from experiments.recorded import length_of
 from experiments.runtime import UserError
 from experiments.train import RunSettings, open_folder, train
 from experiments.ui import recording
+from experiments.ui.play import play, read_consent, read_questions
 from experiments.ui.protocol import (
     BURST,
     LONGEST,
@@ -455,3 +456,46 @@ def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
     with pytest.raises(UserError, match=r"is of probe, not of driving"):
         length_of(session, "driving")
     assert not (tmp_path / "run").exists()
+
+
+# the command
+
+
+@pytest.mark.parametrize(
+    ("changes", "sitting", "more", "line"),
+    [
+        ({"env": "moon"}, {}, {}, "unknown environment 'moon'"),
+        ({"algorithm": "ppo"}, {}, {}, "unknown algorithm 'ppo'"),
+        ({"seed": -1}, {}, {}, "seed must not be negative, got -1"),
+        ({}, {"participant": "a b"}, {}, "participant must be at most 32 letters"),
+        ({}, {"familiarisation": -1}, {}, "familiarisation must not be negative, got -1"),
+        ({}, {}, {"manual_episodes": -2}, "manual_episodes must not be negative, got -2"),
+        ({}, {}, {"host": "0.0.0.0"}, "host must be one of 127.0.0.1"),
+        ({}, {}, {"port": 70000}, "port: cannot listen on 127.0.0.1:70000"),
+    ],
+)
+def test_bad_input_is_told_in_a_line_before_anything_is_built(
+    tmp_path, changes, sitting, more, line
+):
+    settings = dataclasses.replace(SETTINGS, **({"env": "driving"} | changes))
+    with pytest.raises(UserError, match=line):
+        play(settings, tmp_path / "run", False, Sitting(rate=10.0, **sitting), **more)
+    assert not (tmp_path / "run").exists()
+
+
+def test_consent_and_questions_are_read_and_checked(tmp_path):
+    file = tmp_path / "file"
+    with pytest.raises(UserError, match="consent: cannot read"):
+        read_consent(file)
+    file.write_text("")
+    with pytest.raises(UserError, match="consent must have 1 to 20000 letters, got 0"):
+        read_consent(file)
+    file.write_text(" We record.\n")
+    assert read_consent(file) == "We record."
+    with pytest.raises(UserError, match="no JSON list of objects"):
+        read_questions(file)
+    file.write_text('[{"name": "load", "text": "How?", "choices": ["a", 2]}]')
+    assert read_questions(file) == (Question("load", "How?", ("a", "2")),)
+    file.write_text('[{"name": "load", "text": "How?"}, {"name": "load", "text": "Why?"}]')
+    with pytest.raises(UserError, match="a name of its own"):
+        read_questions(file)
