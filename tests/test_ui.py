@@ -56,7 +56,7 @@ PROBE = Probe()
 class ProbeView:
     """Shows what the observation shows."""
 
-    actions = ({"name": "answer", "negative": "-", "positive": "+"},)
+    azimuth = None
 
     def __init__(self):
         self.pictures = 0

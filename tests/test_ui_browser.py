@@ -166,3 +166,27 @@ def test_the_arm_is_shown_and_a_recording_replayed(tmp_path):
         page.keyboard.press("KeyQ")
         assert process.wait(60) == 0
         assert not page.mistakes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "steps"), [("driving", 6000), ("table_wiping", 12_000)])
+def test_the_clock_holds_for_ten_minutes_of_learning(tmp_path, world, steps):
+    out = tmp_path / "run"
+    words = ["play", world, "--total-steps", str(steps), "--no-evaluate"]
+    with playing(out, *words) as (page, process):
+        stage(page, "Ready")
+        page.keyboard.press("Enter")
+        while page.is_hidden("#panel h2:text-is('Done')"):
+            for key in ("Space", "ArrowUp"):
+                page.keyboard.down(key)
+            page.wait_for_timeout(2000)
+            for key in ("Space", "ArrowUp"):
+                page.keyboard.up(key)
+            page.wait_for_timeout(4000)
+        page.keyboard.press("KeyQ")
+        assert process.wait(60) == 0
+        assert not page.mistakes
+    summary = json.loads((out / "summary.json").read_text())
+    print({name: summary[name] for name in ("missed_share", "late_inputs", "human_data_usage")})
+    assert summary["total_steps"] == steps
+    assert summary["missed_share"] < 0.01

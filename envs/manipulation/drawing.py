@@ -17,7 +17,7 @@ import numpy as np
 from envs.manipulation.twin import NutTwin, WipingTwin, make_twin
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
-_CAMERAS = {
+CAMERAS = {
     "table_wiping": {
         "lookat": (0.05, 0.0, 0.95),
         "distance": 1.55,
@@ -100,7 +100,7 @@ class ArmScene:
             self.model.vis.quality.offsamples = 0
         self.renderer = _renderer(mujoco, self.model, *size)
         self.camera = mujoco.MjvCamera()
-        for field, value in _CAMERAS[env.name].items():
+        for field, value in CAMERAS[env.name].items():
             setattr(self.camera, field, value)
         self.options = mujoco.MjvOption()
         self.options.geomgroup[3] = 0  # what is only felt

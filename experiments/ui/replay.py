@@ -72,7 +72,8 @@ class Replay:
             "algorithm": self.config["algorithm"],
             "rate": self.rate,
             "total": self.length,
-            "actions": self.view.actions,
+            "actions": self.columns["executed_action"].shape[1],
+            "azimuth": self.view.azimuth,
             "participant": self.config.get("participant", ""),
             "replay": True,
         }

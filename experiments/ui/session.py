@@ -198,7 +198,8 @@ class Session:
             "rate": self.sitting.rate,
             "total": settings.config.total_steps,
             "horizon": settings.config.prediction_horizon,
-            "actions": self.view.actions,
+            "actions": self.trainee.env.spec.action_size,
+            "azimuth": self.view.azimuth,
             "participant": self.sitting.participant,
         }
 

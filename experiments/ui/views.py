@@ -37,9 +37,14 @@ class Shown(NamedTuple):
 
 
 class View(Protocol):
-    """How a world is shown."""
+    """How a world is shown.
 
-    actions: list[dict[str, Any]]
+    Attributes:
+        azimuth: Direction of view in the plane of the table, degrees from x to y: what "away" means
+            to who looks. None where the first two actions are no such plane.
+    """
+
+    azimuth: float | None
 
     def place(self, state: Any) -> jax.Array:
         """Where a state is, for predicted paths; pure."""
@@ -86,10 +91,7 @@ def _rounded(values: Any, digits: int = 2) -> list[Any]:
 class DrivingView:
     """The road from above."""
 
-    actions = [  # noqa: RUF012 - a constant
-        {"name": "steering", "negative": "right", "positive": "left"},
-        {"name": "pedals", "negative": "brake", "positive": "throttle"},
-    ]
+    azimuth = None
 
     def __init__(self, env: Any):
         self.env = env
@@ -164,10 +166,9 @@ class ArmView:
 
     def __init__(self, env: Any, picture: Picture):
         self.env, self._picture = env, picture
-        names = ["x (away)", "y (left)", "z (up)", "turn about x", "turn about y", "turn about z"]
-        if env.spec.action_size == 7:
-            names.append("gripper")
-        self.actions = [{"name": name, "negative": "-", "positive": "+"} for name in names]
+        from envs.manipulation.drawing import CAMERAS
+
+        self.azimuth = CAMERAS[env.name]["azimuth"]
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_paint, args=(theirs, env.name), daemon=True)

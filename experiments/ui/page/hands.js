@@ -36,7 +36,8 @@ const short = (code) => NAMES[code] ?? code.replace("Key", "");
 
 export class Hands {
   constructor(about, changed, order) {
-    this.size = about.actions.length;
+    this.size = about.actions;
+    this.azimuth = (about.azimuth ?? 0) * Math.PI / 180;
     this.changed = changed;
     this.order = order;
     this.arm = about.env !== "driving";
@@ -125,9 +126,16 @@ export class Hands {
     const pad = this.gamepad();
     if (pad && this.listening) this.#choose(pad);
     else if (pad) this.#add(pad, action);
+    if (this.arm) this.#turn(action);
     if (this.size > GRIPPER) action[GRIPPER] = this.gripper;
     const held = this.toggles ? this.toggled : this.down.has("Space") || this.#read(pad, "take over") > 0.5;
     return { takeover: held, action: action.map((part) => Math.max(-1, Math.min(1, part))) };
+  }
+
+  #turn(action) { // away from who looks is some way across the table
+    const [away, left] = action, c = Math.cos(this.azimuth), s = Math.sin(this.azimuth);
+    action[0] = c * away - s * left;
+    action[1] = s * away + c * left;
   }
 
   #add(pad, action) {
@@ -149,7 +157,7 @@ export class Hands {
 
   help() { // rows of [what, keys]
     const words = this.arm
-      ? ["away", "back", "left", "right", "up", "down", "roll +", "roll -", "tilt +", "tilt -", "turn +", "turn -"]
+      ? ["away", "towards you", "left", "right", "up", "down", "roll +", "roll -", "tilt +", "tilt -", "turn +", "turn -"]
       : ["steer left", "steer right", "throttle", "brake"];
     const rows = [["take over", ["Space"]]];
     this.bindings.forEach(([one, other], i) => rows.push([words[i], [one, other].filter(Boolean)]));
