@@ -35,6 +35,7 @@ from experiments.ui.protocol import (
 )
 from experiments.ui.session import ANSWERS, CONSENT, Question, Session, Sitting
 from experiments.ui.trainee import LOG, Trainee
+from ppl_jax import checkpoint
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.runlog import RunFolder
 from tests.probes import Probe
@@ -276,6 +277,34 @@ def wait_for(what, seconds=60):
     while not what():
         assert time.time() < end, "waited too long"
         time.sleep(0.01)
+
+
+def test_a_method_that_starts_with_demonstrations(tmp_path):
+    config = dataclasses.replace(CONFIG, demonstrations=60, offline_updates=40)
+    settings = dataclasses.replace(SETTINGS, algorithm="iwr", config=config)
+    person = Person(tmp_path / "run", settings=settings)
+    person.session.run()
+    assert person.stages == ["preparing", "ready", "running", "preparing", "running", "finished"]
+    columns, _ = recording.load(tmp_path / "run")
+    assert columns["is_intervention"][:60].all()  # whatever the person's hands say
+    assert not columns["is_intervention"][60:].all()
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["success_rate"] == 1.0
+
+
+def test_a_full_disk_ends_the_session_and_loses_nothing(tmp_path, monkeypatch):
+    made = trainee(tmp_path / "run")
+    drive(made, 30)
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "save", full)
+        with pytest.raises(OSError, match="no space left"):
+            made.close()
+    again = trainee(tmp_path / "run", resume=True)
+    equal(again.learner, made.learner)
+    again.close()
 
 
 def test_methods_that_ask_nobody_are_refused(tmp_path):

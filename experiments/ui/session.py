@@ -328,7 +328,13 @@ class Session:
         mine = trainee.foresee(trainee.learner, action).path if takeover else None
         step = trainee.step(takeover, action, about)
         self._show(trainee.learner, step, takeover, mine)
-        trainee.learn()
+        if trainee.fits_next:
+            self._go("preparing", "learning from what you have shown")
+            trainee.learn()
+            self._go("running")
+            self.clock.start()
+        else:
+            trainee.learn()
         if trainee.complete:
             self._finish()
         elif (step.terminated | step.truncated) and self.sitting.questions:

@@ -83,6 +83,7 @@ class Trainee:
         self.recorder = Recorder(folder.path)
         self._file: Any = None
         self._writer: threading.Thread | None = None
+        self._failure: BaseException | None = None  # of the writer
         self._saved = 0
         self._began = time.perf_counter()
 
@@ -150,6 +151,11 @@ class Trainee:
             or int(self.learner.counters.episodes) < self.manual_episodes
         )
 
+    @property
+    def fits_next(self) -> bool:
+        """The next `learn` makes the many updates on the demonstrations: it takes seconds."""
+        return self._fit is not None and self.steps == self.settings.config.demonstrations
+
     def foresee(self, learner: Learner, action: np.ndarray) -> Foreseen:
         """Where `action` leads if held."""
         return foreseen(self._foresee(learner, jnp.asarray(action), jnp.ones((), bool)))
@@ -200,7 +206,7 @@ class Trainee:
         steps, config = self.steps, self.settings.config
         if steps > config.demonstrations:
             self.learner, metrics = self._learn(self.learner)
-        elif steps == config.demonstrations and self._fit is not None:
+        elif self._fit is not None and steps == config.demonstrations:
             self.learner, metrics = self._fit(self.learner)
         else:
             return
@@ -240,23 +246,38 @@ class Trainee:
     # files
 
     def save(self, wait: bool = False) -> None:
-        """Write a checkpoint, the policy and what was recorded, beside the session."""
-        if self._writer is not None:
-            self._writer.join()
+        """Write a checkpoint, the policy and what was recorded, beside the session.
+
+        Raises:
+            OSError: If what was written before could not be; the log has every step all the same.
+        """
+        self._join()
         self._saved = self.events
         learner, events, rows = jax.tree.map(_copy, self.learner), self.events, self.recorder.take()
 
         def write() -> None:
-            self.recorder.write(rows, events)
-            about = {"env": self.settings.env, "algorithm": self.settings.algorithm}
-            about |= {"seed": self.settings.seed, "step": int(learner.counters.steps)}
-            save_policy(self.folder.path / POLICY, self._policy(learner), about)
-            checkpoint.save(self.folder.checkpoints, events, learner)
+            try:
+                self.recorder.write(rows, events)
+                about = {"env": self.settings.env, "algorithm": self.settings.algorithm}
+                about |= {"seed": self.settings.seed, "step": int(learner.counters.steps)}
+                save_policy(self.folder.path / POLICY, self._policy(learner), about)
+                checkpoint.save(self.folder.checkpoints, events, learner)
+            except BaseException as error:
+                self._failure = error
 
         self._writer = threading.Thread(target=write)
         self._writer.start()
         if wait:
+            self._join()
+
+    def _join(self) -> None:
+        """Wait for the writer, and raise what went wrong there."""
+        if self._writer is not None:
             self._writer.join()
+            self._writer = None
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
 
     def _policy(self, learner: Learner) -> Any:
         return saved_policy(self.env, self.functions.algorithm.policy(learner.algorithm))
@@ -265,12 +286,11 @@ class Trainee:
         """Save what is not saved yet and close the log."""
         if self._file is None:
             return
-        if self.events > self._saved:
-            self.save(wait=True)
-        elif self._writer is not None:
-            self._writer.join()
         self._file.close()
         self._file = None
+        if self.events > self._saved:
+            self.save(wait=True)
+        self._join()
 
     def evaluate(self) -> dict[str, float]:
         """Play every held-out scenario once without the person, and write it down."""
