@@ -25,6 +25,7 @@ from experiments.tables import print_table
 from ppl_jax import algorithms
 from ppl_jax.algorithms.ppl import make_ppl
 from ppl_jax.config import as_arrays
+from ppl_jax.ppo_config import PPOConfig
 from ppl_jax.ppo_lagrangian import make_ppo_lagrangian
 from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
@@ -258,13 +259,15 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
 def _expert(name: str, repeats: int) -> dict[str, float]:
     """Environment steps per second of PPO-Lagrangian, updates included, and the updates' share.
 
-    The share is what a batch with all its epochs takes longer than one with a single epoch, per
-    epoch and times their number.
+    Of the trainer alone: no guidance by a teacher, no batch cut short. The share is what a batch
+    with all its epochs takes longer than one with a single epoch, per epoch and times their number.
     """
     from experiments.expert import settings_for
 
     env = make(name)
-    config, hparams, _ = settings_for(name)
+    settings, hparams, _ = settings_for(name)
+    config = PPOConfig(scaling=settings.scaling)
+    hparams = hparams.replace(max_divergence=1e9)
     seconds, compile_s = {}, 0.0
     for epochs in (1, config.epochs):
         functions = make_ppo_lagrangian(env, dataclasses.replace(config, epochs=epochs))
