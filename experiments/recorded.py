@@ -14,7 +14,7 @@ from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.interaction import Learner, summarise
 from ppl_jax.live import make_live
 from ppl_jax.losses import Metrics
-from ppl_jax.training import Phase, TrainFunctions
+from ppl_jax.training import Phase, TrainFunctions, phases
 from ppl_jax.types import Env
 
 WORD = "recorded "
@@ -41,6 +41,8 @@ def recorded_functions(
     env: Env, make_algorithm: MakeAlgorithm, config: TrainConfig, path: Path
 ) -> TrainFunctions:
     """The training functions of `make_train`, with a recording for world and expert.
+
+    `train` gives the metrics of its last phase as a whole, [1].
 
     The first `config.demonstrations` steps are stored, then there are `config.offline_updates`,
     then an update follows every step, as in the session itself.
@@ -76,6 +78,9 @@ def recorded_functions(
         return live.absorb(learner, part, phase == "interact")
 
     def train(key: jax.Array, hparams: HParams) -> tuple[Learner, Metrics]:
-        raise NotImplementedError("a recording is learnt from chunk by chunk")
+        learner, metrics = live.init(key, hparams), {}
+        for phase, length in phases(config):
+            learner, metrics = run_chunk(learner, length // interval, phase)
+        return learner, jax.tree.map(lambda leaf: leaf[None], metrics)
 
     return TrainFunctions(live.init, run_chunk, train, algorithm)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import envs
 from experiments.evaluate import read_evaluation
 from experiments.policy_file import load_policy
-from experiments.recorded import length_of
+from experiments.recorded import length_of, recorded_functions
 from experiments.runtime import UserError
 from experiments.train import RunSettings, open_folder, train
 from experiments.ui import recording
@@ -35,7 +35,7 @@ from experiments.ui.protocol import (
 )
 from experiments.ui.session import ANSWERS, CONSENT, Question, Session, Sitting
 from experiments.ui.trainee import LOG, Trainee
-from ppl_jax import checkpoint
+from ppl_jax import algorithms, checkpoint
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.runlog import RunFolder
 from tests.probes import Probe
@@ -472,6 +472,18 @@ def test_a_recording_teaches_other_methods(session, tmp_path):
         SETTINGS, algorithm="bc", config=config, expert=f"recorded {session}"
     )
     assert train(settings, tmp_path / "bc")["success_rate"] == 1.0
+
+
+def test_a_recording_as_one_pure_function(session):
+    make = algorithms.method("ppl").make
+    fns = recorded_functions(PROBE, make, CONFIG, session)
+    learner, metrics = jax.jit(fns.train)(jax.random.key(0), SETTINGS.hparams)
+    assert int(learner.counters.steps) == 300
+    assert metrics["train/human_data_usage"].shape == (1,)
+    policy = load_policy(session / "policy.npz", 3, 1)
+    np.testing.assert_allclose(
+        fns.algorithm.policy(learner.algorithm)[0][0], policy.weights[0][0], atol=1e-4
+    )
 
 
 def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
