@@ -486,6 +486,22 @@ def test_a_recording_as_one_pure_function(session):
     )
 
 
+def test_a_session_as_a_minari_data_set(session, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    steps = recording.export_minari(session, "probe/person-v0")
+    columns, _ = recording.load(session)
+    found = list(minari.load_dataset("probe/person-v0").iterate_episodes())
+    assert sum(len(episode.actions) for episode in found) == steps == len(columns["reward"])
+    kept = np.concatenate([episode.infos["is_intervention"][:-1] for episode in found])
+    np.testing.assert_array_equal(kept, columns["is_intervention"])
+    actions = np.concatenate([episode.actions for episode in found])
+    np.testing.assert_array_equal(actions, columns["executed_action"])
+    assert all(len(e.observations) == len(e.actions) + 1 for e in found)
+    with pytest.raises(UserError, match="minari"):
+        recording.export_minari(session, "probe/person-v0")
+
+
 def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
     settings = dataclasses.replace(SETTINGS, expert=f"recorded {session}")
     longer = dataclasses.replace(CONFIG, total_steps=400)

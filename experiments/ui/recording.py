@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -246,7 +247,7 @@ def export_minari(run: Path, name: str) -> int:
         from minari.data_collector import EpisodeBuffer
     except ImportError as error:
         raise UserError(
-            f"a Minari data set needs the package {error.name}: pip install 'minari[hdf5]'"
+            f"a Minari data set needs the package {error.name}: pip install 'ppl-jax[minari]'"
         ) from error
     columns, config = load(run)
     size, actions = columns["observation"].shape[1], columns["executed_action"].shape[1]
@@ -272,14 +273,16 @@ def export_minari(run: Path, name: str) -> int:
             )
         )
     try:
-        minari.create_dataset_from_buffers(
-            name,
-            found,
-            observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32),
-            action_space=gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32),
-            algorithm_name=str(config.get("algorithm")),
-            description=f"a person at the gate of {config.get('env')} (ppl_jax)",
-        )
+        # it warns that neither author nor link to code is named: both are the user's to add
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            minari.create_dataset_from_buffers(
+                name,
+                found,
+                observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32),
+                action_space=gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32),
+                algorithm_name=str(config.get("algorithm")),
+                description=f"a person at the gate of {config.get('env')} (ppl_jax)",
+            )
     except ValueError as error:
         raise UserError(f"minari: {error}") from error
     return len(columns[EPISODE])
