@@ -122,6 +122,15 @@ def test_a_person_drives_with_keys_and_a_gamepad(tmp_path):
         page.evaluate("press(3, 1)")
         page.wait_for_selector("#mapping button:text-is('button 3')")
         page.evaluate("press(3, 0)")
+
+        # the button that pauses goes on again
+        page.evaluate("press(9, 1)")
+        page.wait_for_selector("#panel", state="hidden")
+        page.evaluate("press(9, 0)")
+        page.wait_for_timeout(300)
+        page.evaluate("press(9, 1)")
+        stage(page, "Paused")
+        page.evaluate("press(9, 0)")
         page.keyboard.press("Enter")
         stage(page, "Done")
         assert not page.mistakes

@@ -20,13 +20,13 @@ const GRIPPER = 6;
 // function -> gamepad button or axis of the Xbox layout
 const DRIVING_PAD = {
   "take over": { button: 5 }, "throttle": { button: 7 }, "brake": { button: 6 },
-  "steer": { axis: 0, sign: -1 }, "pause": { button: 9 },
+  "steer": { axis: 0, sign: -1 }, "pause, go on": { button: 9 },
 };
 const ARM_PAD = {
   "take over": { button: 5 }, "away": { axis: 1, sign: -1 }, "left": { axis: 0, sign: -1 },
   "up": { axis: 3, sign: -1 }, "turn": { axis: 2, sign: -1 },
   "tilt +": { button: 12 }, "tilt -": { button: 13 }, "roll +": { button: 14 }, "roll -": { button: 15 },
-  "gripper": { button: 2 }, "pause": { button: 9 },
+  "gripper": { button: 2 }, "pause, go on": { button: 9 },
 };
 const NAMES = {
   Space: "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", ArrowUp: "\u2191", ArrowDown: "\u2193",
@@ -43,7 +43,8 @@ export class Hands {
     this.arm = about.env !== "driving";
     this.bindings = (this.arm ? ARM : DRIVING).filter(([, , axis]) => axis < this.size);
     this.storage = "ppl-pad-" + (this.arm ? "arm" : "driving");
-    this.pad = { ...(this.arm ? ARM_PAD : DRIVING_PAD), ...this.#stored() };
+    this.pad = { ...(this.arm ? ARM_PAD : DRIVING_PAD) };
+    for (const [name, bound] of Object.entries(this.#stored())) if (name in this.pad) this.pad[name] = bound;
     this.down = new Set();
     this.value = new Array(this.size).fill(0);
     this.gripper = -1;
@@ -150,7 +151,13 @@ export class Hands {
       action[1] += read("throttle") - read("brake");
     }
     if (this.#pressed(pad, "take over") && this.toggles) this.toggled = !this.toggled;
-    if (this.#pressed(pad, "pause")) this.order("pause");
+    if (this.#pressed(pad, "pause, go on")) this.order("pause");
+  }
+
+  standing() { // the clock stands: the button that stopped it starts it
+    const pad = this.gamepad();
+    if (pad && this.listening) this.#choose(pad);
+    else if (pad && this.#pressed(pad, "pause, go on")) this.order("start");
   }
 
   release() { this.toggled = false; this.down.clear(); }

@@ -260,14 +260,18 @@ function keys() {
   for (const radio of document.querySelectorAll("input[name=hold]")) {
     radio.onchange = () => { hands.toggles = radio.value === "toggle" && radio.checked; hands.release(); render(); radio.blur(); };
   }
-  setInterval(pads, 500);
+  setInterval(pads, 100);
 }
 
+const NO_PAD = $("pad").textContent;
 let mapped = "";
 function pads() {
   const pad = hands.gamepad();
-  if (!pad) return;
-  if (hands.listening) hands.now();
+  if (!pad) {
+    if (mapped) { mapped = ""; $("pad").textContent = NO_PAD; $("mapping").replaceChildren(); }
+    return;
+  }
+  if (!["running", "practice"].includes(status.stage)) hands.standing();
   const key = JSON.stringify([hands.pad, hands.listening, pad.id]);
   if (key === mapped) return;
   mapped = key;
