@@ -2,6 +2,7 @@
 
 const RAMP = { press: 4, release: 7 }; // per second: a key is no lever, so it moves one
 const DEAD = 0.12; // of a stick
+const SLOW = 0.4; // of the arm's full speed, 0.3 m/s: too fast for keys near a peg
 
 const DRIVING = [
   ["ArrowLeft", "KeyA", 0, 1], ["ArrowRight", "KeyD", 0, -1],
@@ -28,7 +29,9 @@ const ARM_PAD = {
   "tilt +": { button: 12 }, "tilt -": { button: 13 }, "roll +": { button: 14 }, "roll -": { button: 15 },
   "gripper": { button: 2 }, "pause, go on": { button: 9 },
 };
+const FAST = ["ShiftLeft", "ShiftRight"];
 const NAMES = {
+  ShiftLeft: "Shift",
   Space: "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", ArrowUp: "\u2191", ArrowDown: "\u2193",
   PageUp: "PgUp", PageDown: "PgDn",
 };
@@ -66,7 +69,7 @@ export class Hands {
     if (event.target.matches?.("input[type=text], textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.target.matches?.("button, summary") && (event.code === "Space" || event.code === "Enter")) return;
     const code = event.code;
-    const known = code === "Space" || (this.arm && code === "KeyG") ||
+    const known = code === "Space" || (this.arm && FAST.includes(code)) || (this.arm && code === "KeyG") ||
       this.bindings.some(([one, other]) => code === one || code === other);
     if (!known) return;
     event.preventDefault();
@@ -78,9 +81,10 @@ export class Hands {
   }
 
   #keys(seconds) {
+    const full = this.arm && !FAST.some((code) => this.down.has(code)) ? SLOW : 1;
     const wanted = new Array(this.size).fill(0);
     for (const [one, other, axis, sign] of this.bindings) {
-      if (this.down.has(one) || (other && this.down.has(other))) wanted[axis] += sign;
+      if (this.down.has(one) || (other && this.down.has(other))) wanted[axis] += sign * full;
     }
     this.value = this.value.map((now, axis) => {
       const most = seconds * (wanted[axis] ? RAMP.press : RAMP.release);
@@ -168,6 +172,7 @@ export class Hands {
       : ["steer left", "steer right", "throttle", "brake"];
     const rows = [["take over", ["Space"]]];
     this.bindings.forEach(([one, other], i) => rows.push([words[i], [one, other].filter(Boolean)]));
+    if (this.arm) rows.push(["fast", ["ShiftLeft"]]);
     if (this.size > GRIPPER) rows.push(["open or close gripper", ["KeyG"]]);
     return rows.map(([what, codes]) => [what, codes.map(short)]);
   }

@@ -139,7 +139,7 @@ function drawLoss() {
 const BUTTONS = [ // name, what it says, its key, stages in which it works
   ["start", "Start", "Enter", ["ready", "paused", "practice"]],
   ["pause", "Pause", "KeyP", ["running", "practice"]],
-  ["restart", "Restart episode", "Backspace", ["running", "paused"]],
+  ["restart", "Restart", "Backspace", ["running", "paused"]],
   ["practice", "Practise", "KeyX", ["ready", "paused", "running"]],
   ["save", "Save", "KeyV", ["ready", "running", "paused"]],
   ["quit", "Save, quit", "KeyQ", ["consent", "ready", "running", "paused", "practice", "questions", "finished"]],
