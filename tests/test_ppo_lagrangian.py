@@ -237,6 +237,21 @@ def test_in_later_rounds_the_clone_plays():
         assert float(jnp.mean(score(Probe, made, learner).success)) == success
 
 
+@pytest.mark.parametrize("step", [0, 1])
+def test_of_a_stride_the_step_with_the_greatest_disagreement_is_kept(step):
+    def expert(key, state, observation, params):
+        return jnp.where(state.time == step, 0.9, 0.0)[None]
+
+    config = dataclasses.replace(
+        TINY, demonstrations=128, cloning_updates=10, demonstration_stride=2
+    )
+    made = make_ppo_lagrangian(TwoSteps(), config, expert=expert)
+    learner = made.init(jax.random.key(0), PPOHParams(demonstration_noise=0.0))
+    learner, _ = jax.jit(made.clone)(learner)
+    assert float(learner.learned.inputs.count) == 64
+    assert float(learner.learned.inputs.mean[0]) == step  # what is observed is the time
+
+
 @pytest.mark.parametrize(("weight", "reached"), [(0.0, 1.0), (10.0, -0.5)])
 def test_a_guided_policy_keeps_to_the_expert(weight, reached):
     config = dataclasses.replace(TINY, guided=True)
