@@ -19,7 +19,7 @@ from envs.driving.scenario import Scenario, take
 from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
 
 CRUISE_SPEED = 12.0  # m/s
-CAUTIOUS_SPEED = 6.0  # m/s: what a single look at the road tells is then enough
+CAUTIOUS_SPEED = 5.0  # m/s: what a single look at the road tells is then enough
 LATERAL_ACCELERATION = 3.5  # m/s^2, allowed in bends
 COMFORT_BRAKING = 3.0  # m/s^2, when slowing for a bend or an object
 CREEP_SPEED = 1.5  # m/s, to steer round something from standstill
