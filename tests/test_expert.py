@@ -23,7 +23,7 @@ if "probe" not in envs.registered():
     envs.register("probe", Probe)
 WORDS = ["--total-steps", "1024", "--worlds", "8", "--rollout-steps", "32", "--minibatches", "2"]
 WORDS += ["--hidden", "8", "--demonstrations", "64", "--cloning-updates", "20"]
-SHIPPED = ("table_wiping", "nut_assembly")  # driving: not yet
+SHIPPED = ("driving", "table_wiping", "nut_assembly")
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +201,7 @@ def test_a_shipped_expert_is_small_and_has_its_card(name):
 @pytest.mark.parametrize(
     ("name", "least", "cost"),
     [
+        ("driving", 0.9, 1.0),
         ("table_wiping", 0.9, 1.0),
         pytest.param("nut_assembly", 0.6, 1.0, marks=pytest.mark.slow),
     ],
