@@ -189,7 +189,7 @@ def over_axis(
         if column in ("success", "progress"):
             axes.set_ylim(0, 1.02)
         _plain(axes)
-        axes.legend(frameon=False, fontsize=8, loc="lower left")
+        axes.legend(frameon=False, fontsize=8, loc="best")
     _finish(picture, f"Means with 95% bootstrap intervals over seeds, {_seeds(points)}.", out)
 
 
