@@ -31,7 +31,7 @@ from ppl_jax.predictor import predict
 from ppl_jax.training import make_train
 
 STEPS = 200  # environment steps per timed call
-SWEEP, SWEEP_STEPS = 64, 3000  # runs, and their length: ten minutes instead of half an hour
+SWEEP, SWEEP_STEPS = 64, 3000  # runs, and their length: a quarter of an hour in all
 CONTACT_STEPS = 60  # after which an arm's tool is in contact
 
 
