@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import Outcome, StepInfo, WorldSpec
+from ppl_jax.types import EnvSpec, Outcome, StepInfo
 
 
 class Environment:
@@ -17,9 +17,9 @@ class Environment:
     """
 
     name: str
-    spec: WorldSpec
+    spec: EnvSpec
     max_episode_steps: int
-    one_by_one: bool = False
+    sequential_on_cpu: bool = False
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: Any) -> Any:
         """The start of scenario `index`."""

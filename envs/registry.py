@@ -54,13 +54,13 @@ def _driving(**options: Any) -> Any:
 
 
 def _table_wiping(**options: Any) -> Any:
-    from envs.manipulation.wiping import make_table_wiping
+    from envs.manipulation.tasks.wiping import make_table_wiping
 
     return make_table_wiping(**options)
 
 
 def _nut_assembly(**options: Any) -> Any:
-    from envs.manipulation.nut import make_nut_assembly
+    from envs.manipulation.tasks.nut import make_nut_assembly
 
     return make_nut_assembly(**options)
 

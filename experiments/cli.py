@@ -13,8 +13,8 @@ import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from envs.compiler import set_xla_flags
-from experiments.engines import SERVE
-from experiments.runtime import UserError
+from experiments.engine.runtime import UserError
+from experiments.engine.schedulers import SERVE
 
 
 @dataclasses.dataclass
@@ -68,23 +68,25 @@ class Train:
     """Of Adam."""
     min_speed: float | None = None
     """Gate: predicted mean speed below which the expert takes over, m/s."""
-    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] | None = None
+    gate: (
+        Literal["unsafe_or_slow", "low_return", "deviates_from_expert", "action_probability"] | None
+    ) = None
     """What makes the expert take over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
-    """Gate departs: how far from the expert's own path, in the world's units."""
+    """Gate deviates_from_expert: how far from the expert's own path, in the world's units."""
     min_log_density: float | None = None
-    """Gate unlikely: log-density under a neural expert below which it takes over."""
+    """Gate action_probability: log-density under a neural expert below which it takes over."""
     discount: float | None = None
     """gamma, of methods with action values."""
-    target_rate: float | None = None
+    polyak_tau: float | None = None
     """tau of target networks."""
     margin: float | None = None
     """EIL: hinge margins."""
     conservative_weight: float | None = None
     """HACO: weight of raising the expert's values over the novice's."""
-    max_doubt: float | None = None
+    max_ensemble_variance: float | None = None
     """Ensemble-DAgger: variance of the members above which the expert acts."""
     max_discrepancy: float | None = None
     """Ensemble-DAgger: squared distance from the expert's action above which the expert acts."""
@@ -145,14 +147,16 @@ class Compare:
     """Environment steps of each run (bc and gail keep their own)."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
-    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] | None = None
+    gate: (
+        Literal["unsafe_or_slow", "low_return", "deviates_from_expert", "action_probability"] | None
+    ) = None
     """What makes the expert take over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
-    """Gate departs: how far from the expert's own path, in the world's units."""
+    """Gate deviates_from_expert: how far from the expert's own path, in the world's units."""
     min_log_density: float | None = None
-    """Gate unlikely: log-density under a neural expert below which it takes over."""
+    """Gate action_probability: log-density under a neural expert below which it takes over."""
     batch_size: int | None = None
     """Samples per loss and update."""
     preset: Literal["default", "paper", "reference"] = "default"
@@ -234,13 +238,13 @@ class ExpertTrain:
     """Random seed."""
     total_steps: int | None = None
     """Environment steps."""
-    worlds: int | None = None
+    num_envs: int | None = None
     """Worlds stepped side by side."""
     rollout_steps: int | None = None
     """Steps of each world per batch."""
     epochs: int | None = None
     """Passes over a batch."""
-    minibatches: int | None = None
+    num_minibatches: int | None = None
     """Updates per pass."""
     hidden: tuple[int, ...] | None = None
     """Widths of the hidden layers of policy and critics."""
@@ -270,27 +274,27 @@ class ExpertTrain:
     """gamma of the reward."""
     cost_discount: float | None = None
     """gamma of the cost."""
-    smoothing: float | None = None
+    gae_lambda: float | None = None
     """lambda of the generalised advantages."""
     clip: float | None = None
     """PPO's bound on the ratio."""
-    max_divergence: float | None = None
+    target_kl: float | None = None
     """KL at which a batch's policy updates stop."""
-    max_gradient: float | None = None
+    max_grad_norm: float | None = None
     """Norm to which gradients are clipped."""
-    entropy_weight: float | None = None
+    entropy_coef: float | None = None
     """Weight of the policy's entropy."""
     cost_limit: float | None = None
     """Mean cost per episode that is allowed."""
-    cost_ends: float | None = None
+    terminate_on_cost: float | None = None
     """1 where nothing is worth anything after a step that costs, 0 otherwise."""
     initial_multiplier: float | None = None
     """Of the cost, at the start."""
-    multiplier_rate: float | None = None
+    lagrangian_lr: float | None = None
     """Adam's rate for the multiplier."""
     initial_std: float | None = None
     """Standard deviation of the actions at the start."""
-    least_std: float | None = None
+    min_std: float | None = None
     """Standard deviation of the actions at least."""
     final_std: float | None = None
     """Bound on it at the end."""
@@ -645,8 +649,8 @@ MOST_PAIRS = 10  # that preference_horizon "auto" may choose
 
 def run_settings(command: Train):
     """Turn the command line into settings of a run."""
-    from experiments.recorded import length_of, recording_of
-    from experiments.train import RunSettings
+    from experiments.engine.recorded import length_of, recording_of
+    from experiments.engine.run import RunSettings
     from ppl_jax.algorithms import settings
 
     try:
@@ -705,9 +709,9 @@ def default_interval(config) -> int:
 
 
 def _train(command: Train) -> None:
-    from experiments.runtime import start_jax
-    from experiments.tables import print_run
-    from experiments.train import check, train
+    from experiments.engine.run import check, train
+    from experiments.engine.runtime import start_jax
+    from experiments.report.tables import print_run
 
     settings = run_settings(command)
     every = min(settings.evaluate_every, max(settings.config.total_steps, 1))
@@ -722,23 +726,23 @@ def _train(command: Train) -> None:
 
 
 def _evaluate(command: Evaluate) -> None:
-    from experiments.evaluate import evaluate_run
-    from experiments.runtime import start_jax
-    from experiments.tables import print_evaluation
+    from experiments.engine.evaluate import evaluate_run
+    from experiments.engine.runtime import start_jax
+    from experiments.report.tables import print_evaluation
 
     start_jax()
     rows = evaluate_run(command.run, command.scenarios)
     if command.out is not None:
-        from experiments.tables import write_rows
+        from experiments.report.tables import write_rows
 
         write_rows(command.out, [row._asdict() for row in rows])
     print_evaluation(str(command.run), rows)
 
 
 def _compare(command: Compare) -> None:
-    from experiments import paper
-    from experiments.compare import compare
-    from experiments.tables import EPISODES, print_comparison
+    from experiments.report import paper
+    from experiments.report.tables import EPISODES, print_comparison
+    from experiments.studies.compare import compare
 
     try:
         compare(command)
@@ -747,9 +751,9 @@ def _compare(command: Compare) -> None:
 
 
 def _ablation(command: Ablation) -> None:
-    from experiments import paper
-    from experiments.ablation import ablation
-    from experiments.tables import EPISODES, print_comparison
+    from experiments.report import paper
+    from experiments.report.tables import EPISODES, print_comparison
+    from experiments.studies.ablation import ablation
 
     try:
         ablation(command)
@@ -758,22 +762,22 @@ def _ablation(command: Ablation) -> None:
 
 
 def _tune(command: Tune) -> None:
-    from experiments.tune import tune
+    from experiments.studies.tune import tune
 
     tune(command)
 
 
 def _sweep(command: Sweep) -> None:
-    from experiments.runtime import start_jax
-    from experiments.sweep import sweep
+    from experiments.engine.runtime import start_jax
+    from experiments.studies.runner import sweep
 
     start_jax()
     sweep(command)
 
 
 def _horizon(command: Horizon) -> None:
-    from experiments.horizon import measure_horizon
-    from experiments.runtime import start_jax
+    from experiments.engine.runtime import start_jax
+    from experiments.studies.horizon import measure_horizon
 
     start_jax()
     measure_horizon(command)
@@ -781,13 +785,13 @@ def _horizon(command: Horizon) -> None:
 
 
 def _table(command: Table) -> None:
-    from experiments.report import table
+    from experiments.report.points import table
 
     table(command)
 
 
 def _figure(command: Figure) -> None:
-    from experiments.figures import figure
+    from experiments.report.figures import figure
 
     figure(command)
     print(f"wrote {command.out}")
@@ -799,15 +803,21 @@ def _expert(command: Expert) -> None:
     elif isinstance(command.command, ExpertEvaluate):
         _expert_evaluate(command.command)
     else:
-        from experiments.card import write_card
+        from experiments.report.card import write_card
 
         write_card(command.command.run, command.command.out)
 
 
 def _expert_train(command: ExpertTrain) -> None:
-    from experiments.expert import EVALUATIONS, ExpertSettings, check, settings_for, train_expert
-    from experiments.runtime import start_jax
-    from experiments.tables import print_run
+    from experiments.engine.expert import (
+        EVALUATIONS,
+        ExpertSettings,
+        check,
+        settings_for,
+        train_expert,
+    )
+    from experiments.engine.runtime import start_jax
+    from experiments.report.tables import print_run
 
     config, hparams, training = settings_for(command.env)
     given = {name: value for name, value in vars(command).items() if value is not None}
@@ -840,10 +850,10 @@ def _expert_train(command: ExpertTrain) -> None:
 
 
 def _expert_evaluate(command: ExpertEvaluate) -> None:
-    from experiments.evaluate import make_world
-    from experiments.expert import evaluate_expert
-    from experiments.runtime import start_jax
-    from experiments.tables import print_evaluation, write_rows
+    from experiments.engine.evaluate import make_world
+    from experiments.engine.expert import evaluate_expert
+    from experiments.engine.runtime import start_jax
+    from experiments.report.tables import print_evaluation, write_rows
 
     start_jax()
     options = {} if command.scenarios is None else {"held_out_scenarios": command.scenarios}
@@ -856,7 +866,7 @@ def _expert_evaluate(command: ExpertEvaluate) -> None:
 def _export(command: Export) -> None:
     import shutil
 
-    from experiments.evaluate import policy_path, read_policy, run_spec
+    from experiments.engine.evaluate import policy_path, read_policy, run_spec
 
     source = policy_path(command.run)
     read_policy(source, run_spec(command.run))
@@ -865,8 +875,8 @@ def _export(command: Export) -> None:
 
 
 def _render(command: Render) -> None:
-    from experiments.render import render
-    from experiments.runtime import start_jax
+    from experiments.engine.runtime import start_jax
+    from experiments.report.film import render
 
     start_jax()
     render(command.run, command.scenario, command.out, command.steps, command.env)
@@ -874,9 +884,9 @@ def _render(command: Render) -> None:
 
 
 def _play(command: Play) -> None:
-    from experiments.runtime import start_jax
+    from experiments.engine.runtime import start_jax
     from experiments.ui.play import play, read_consent, read_questions
-    from experiments.ui.session import Sitting
+    from experiments.ui.session import SessionConfig
     from experiments.ui.views import RATES
 
     shared = {f.name for f in dataclasses.fields(Train)}
@@ -887,7 +897,7 @@ def _play(command: Play) -> None:
         raise UserError(f"rate must lie between 0.1 and 1000, got {rate}")
     if command.resume and command.out is None:
         raise UserError("--resume needs --out, the run folder to go on with")
-    sitting = Sitting(
+    sitting = SessionConfig(
         rate=rate,
         participant=command.participant,
         consent=None if command.consent is None else read_consent(command.consent),
@@ -914,7 +924,7 @@ def _new_folder(command: Train | Play) -> Path:
 
 
 def _replay(command: Replay) -> None:
-    from experiments.runtime import start_jax
+    from experiments.engine.runtime import start_jax
     from experiments.ui.replay import replay
 
     start_jax()
@@ -922,7 +932,7 @@ def _replay(command: Replay) -> None:
 
 
 def _recording(command: Recording) -> None:
-    from experiments.ui.recording import export, export_minari
+    from experiments.engine.recording import export, export_minari
 
     if command.minari is not None:
         steps = export_minari(command.run, command.minari)
@@ -933,15 +943,15 @@ def _recording(command: Recording) -> None:
 
 
 def _bench(command: Bench) -> None:
-    from experiments.bench import bench
-    from experiments.runtime import start_jax
+    from experiments.engine.runtime import start_jax
+    from experiments.tools.bench import bench
 
     start_jax()
     bench(command.repeats, command.parts, command.out)
 
 
 def _doctor(command: Doctor) -> None:
-    from experiments.doctor import doctor
+    from experiments.tools.doctor import doctor
 
     doctor()
 
@@ -972,7 +982,7 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
     if (sys.argv[1:] if argv is None else argv) == [SERVE]:
-        from experiments.worker import serve
+        from experiments.engine.worker import serve
 
         return serve()
     command = tyro.cli(Command, prog="ppl", args=argv, description=__doc__)

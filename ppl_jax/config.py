@@ -28,13 +28,13 @@ class HParams:
         min_speed: Gate: the expert takes over where the predicted mean speed is below, m/s.
         min_return: Gate of the released code and of manipulation: where the predicted return is
             at or below (the paper's epsilon).
-        max_departure: Gate "departs": how far the prediction may end from where the expert would,
-            in the world's units (`WorldSpec.observation_scale`).
-        min_log_density: Gate "unlikely": log-density under the expert below which it takes over.
-        discount, target_rate: gamma, and tau of target networks (methods with critics).
+        max_departure: Gate "deviates_from_expert": how far the prediction may end from where the expert would,
+            in the world's units (`EnvSpec.observation_scale`).
+        min_log_density: Gate "action_probability": log-density under the expert below which it takes over.
+        discount, polyak_tau: gamma, and tau of target networks (methods with critics).
         margin: EIL: hinge margins of its action values.
         conservative_weight: HACO: c, weight of raising expert's over novice's action values.
-        max_doubt: Ensemble-DAgger: variance of the members' actions above which the expert acts.
+        max_ensemble_variance: Ensemble-DAgger: variance of the members' actions above which the expert acts.
         max_discrepancy: Ensemble-DAgger: squared distance between the novice's and the expert's
             action above which the expert acts.
         switch_rate: Thrifty-DAgger: alpha, share of the novice's states that each of its two tests
@@ -56,10 +56,10 @@ class HParams:
     max_departure: jax.Array | float = 1.0
     min_log_density: jax.Array | float = -3.0
     discount: jax.Array | float = 0.99
-    target_rate: jax.Array | float = 0.005
+    polyak_tau: jax.Array | float = 0.005
     margin: jax.Array | float = 0.1
     conservative_weight: jax.Array | float = 10.0
-    max_doubt: jax.Array | float = 0.01
+    max_ensemble_variance: jax.Array | float = 0.01
     max_discrepancy: jax.Array | float = 0.05
     switch_rate: jax.Array | float = 0.1
     discriminator_rate: jax.Array | float = 3e-4
@@ -85,7 +85,7 @@ class TrainConfig:
         human_capacity, preference_capacity: Of the ring buffers; the oldest go first.
         predictor: The world's own transition, or the rule-based kinematic one.
         gate: What makes the expert take over: an unsafe or slow prediction, a low return, or one
-            that departs from what the expert would do from here (one more lookahead per decision;
+            that deviates_from_expert from what the expert would do from here (one more lookahead per decision;
             it asks the policy again at every predicted state), or an action that the expert
             finds unlikely (neural experts alone).
         gate_rollout: The lookahead holds the proposed action, or asks the policy again at every
@@ -116,7 +116,9 @@ class TrainConfig:
     human_capacity: int = 50_000
     preference_capacity: int = 50_000
     predictor: Literal["simulator", "kinematic"] = "simulator"
-    gate: Literal["unsafe_or_slow", "low_return", "departs", "unlikely"] = "unsafe_or_slow"
+    gate: Literal["unsafe_or_slow", "low_return", "deviates_from_expert", "action_probability"] = (
+        "unsafe_or_slow"
+    )
     gate_rollout: Literal["constant", "closed_loop"] = "constant"
     pair_states: Literal["predicted", "shifted"] = "predicted"
     likelihood: Literal["gaussian", "laplace"] = "gaussian"
@@ -223,16 +225,16 @@ _NOT_NEGATIVE = (
     "expert_noise",
     "learning_rate",
     "max_departure",
-    "target_rate",
+    "polyak_tau",
     "margin",
     "conservative_weight",
-    "max_doubt",
+    "max_ensemble_variance",
     "max_discrepancy",
     "switch_rate",
     "discriminator_rate",
     "survival_correction",
 )
-_SHARES = ("discount", "target_rate", "switch_rate", "survival_correction")
+_SHARES = ("discount", "polyak_tau", "switch_rate", "survival_correction")
 
 
 def validate(config: TrainConfig, hparams: HParams) -> None:

@@ -38,7 +38,7 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
     `act` is called on one world at a time; it never sees anything of the expert. Episodes run in
     lock step until the last has ended.
     """
-    one_by_one = env.one_by_one and jax.default_backend() == "cpu"
+    sequential_on_cpu = env.sequential_on_cpu and jax.default_backend() == "cpu"
 
     def evaluate(params: Any, key: jax.Array) -> Episodes:
         count = env.scenario_count(params)
@@ -65,7 +65,7 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
             key, states, alive, so_far, time = carry
             key, key_step = jax.random.split(key)
             keys = jax.random.split(key_step, count)
-            if one_by_one:
+            if sequential_on_cpu:
                 states, out = jax.lax.map(one_if, (alive, keys, states))
             else:
                 states, out = jax.vmap(one)(keys, states)

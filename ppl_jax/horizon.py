@@ -29,8 +29,8 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import COMPARING, RULES
-from ppl_jax.predictor import Act, predict, selected_transition
+from ppl_jax.gates import COMPARING, RULES
+from ppl_jax.predictors import Act, predict, selected_transition
 from ppl_jax.types import Env, Expert
 
 MEMORY = 500  # predicted trajectories that the moving means look back
@@ -55,7 +55,7 @@ class Measured(NamedTuple):
 def measure(
     observation: jax.Array,
     predicted: jax.Array,
-    advice: jax.Array,
+    expert_actions: jax.Array,
     expert_action: jax.Array,
     novice_action: jax.Array,
     scale: jax.Array,
@@ -65,12 +65,12 @@ def measure(
     Args:
         observation: [O] where the expert took over.
         predicted: [M, O] predicted observations.
-        advice: [M, A] the expert's action at each.
+        expert_actions: [M, A] the expert's action at each.
         expert_action, novice_action: [A] a_h and a_n, both from `observation`.
         scale: [O] units of the observation.
     """
-    drift = jnp.linalg.norm(advice - expert_action, axis=-1)
-    other = jnp.linalg.norm(advice - novice_action, axis=-1)
+    drift = jnp.linalg.norm(expert_actions - expert_action, axis=-1)
+    other = jnp.linalg.norm(expert_actions - novice_action, axis=-1)
     reach = jnp.linalg.norm((predicted - observation) / scale, axis=-1)
     apart = jnp.linalg.norm(expert_action - novice_action)
     return Measured((drift >= other).astype(jnp.float32), drift, reach, apart)
@@ -212,15 +212,15 @@ def make_profile(
                 params,
                 ahead,
                 observe=True,
-                advisor=expert,
+                labelling_expert=expert,
             )
             judged = jax.tree.map(lambda leaf: leaf[: config.prediction_horizon], found)
             takeover = rule(judged, None, hparams, scale)
-            assert found.advice is not None  # an advisor was there
-            states, advice, valid = (
-                leaf[:most] for leaf in (found.observation, found.advice, found.valid)
+            assert found.expert_actions is not None  # an labelling_expert was there
+            states, expert_actions, valid = (
+                leaf[:most] for leaf in (found.observation, found.expert_actions, found.valid)
             )
-            measured = measure(observation, states, advice, wanted, novice, scale)
+            measured = measure(observation, states, expert_actions, wanted, novice, scale)
             after = env.step(key_step, state, held, params)
             row = (observation, states, measured, takeover & valid)
             return (key, *after[:2]), row

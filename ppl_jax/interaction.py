@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.config import HParams, TrainConfig, as_arrays
 from ppl_jax.losses import Metrics
-from ppl_jax.predictor import add_noise, predict, selected_transition
+from ppl_jax.predictors import add_noise, predict, selected_transition
 from ppl_jax.types import Env, Expert, Interaction, Trajectory
 
 PyTree = Any
@@ -34,7 +34,7 @@ class Counters:
         takeovers: Times the expert took control.
         episodes, successes: Training episodes that ended, and with success.
         cost: Sum of step costs while training.
-        broken: Episodes that ended because the physics broke down.
+        physics_diverged: Episodes that ended because the physics broke down.
     """
 
     steps: jax.Array
@@ -43,7 +43,7 @@ class Counters:
     episodes: jax.Array
     successes: jax.Array
     cost: jax.Array
-    broken: jax.Array
+    physics_diverged: jax.Array
 
 
 @flax.struct.dataclass
@@ -74,21 +74,21 @@ class Steps(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        propose: `propose(learner, key, observation) -> action [A]` of the novice, not yet clipped.
-        advise: `advise(learner, key, observation) -> action [A]` of the expert, with its noise.
+        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the novice, not yet clipped.
+        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with its noise.
         interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step of
             whoever `learner.takeover` says, the expert's action being `action` where it is given.
             `started`: an expert in control was not in the step before.
-        absorb: `absorb(learner, interaction) -> Learner`: store a recorded step as if made now.
+        ingest: `ingest(learner, interaction) -> Learner`: store a recorded step as if made now.
         learn: `learn(learner, update) -> (Learner, Metrics)`: one update; where a loss is not
             finite, what was learned stays as it was before.
     """
 
     init: Callable[[jax.Array, HParams], Learner]
-    propose: Callable[[Learner, jax.Array, jax.Array], jax.Array]
-    advise: Callable[[Learner, jax.Array, jax.Array], jax.Array]
+    sample_novice_action: Callable[[Learner, jax.Array, jax.Array], jax.Array]
+    query_expert: Callable[[Learner, jax.Array, jax.Array], jax.Array]
     interact: Callable[..., tuple[Learner, Interaction]]
-    absorb: Callable[[Learner, Interaction], Learner]
+    ingest: Callable[[Learner, Interaction], Learner]
     learn: Callable[..., tuple[Learner, Metrics]]
 
 
@@ -123,7 +123,7 @@ def make_steps(
             diverged=jnp.zeros((), bool),
         )
 
-    def propose(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
+    def sample_novice_action(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
         key_act, key_guess = jax.random.split(key)
         action = algorithm.act(learner.algorithm, key_act, observation)
         if config.random_steps:
@@ -131,7 +131,7 @@ def make_steps(
             action = jnp.where(learner.counters.steps < config.random_steps, guess, action)
         return action
 
-    def advise(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
+    def query_expert(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
         """The expert's action, with its noise."""
         assert expert is not None  # else the caller of `interact` says what it does
         key_expert, key_noise = jax.random.split(key)
@@ -153,7 +153,7 @@ def make_steps(
                 params,
                 horizon,
                 observe=True,
-                advisor=expert if config.adaptive_horizon else None,
+                labelling_expert=expert if config.adaptive_horizon else None,
             )
 
         def nothing() -> Trajectory:
@@ -175,7 +175,9 @@ def make_steps(
         noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
         return dataclasses.replace(trajectory, observation=noisy)
 
-    def store(learner: Learner, step: Interaction, broken: jax.Array | bool = False) -> Learner:
+    def store(
+        learner: Learner, step: Interaction, physics_diverged: jax.Array | bool = False
+    ) -> Learner:
         counters, done = learner.counters, step.terminated | step.truncated
         return dataclasses.replace(
             learner,
@@ -187,11 +189,11 @@ def make_steps(
                 episodes=counters.episodes + done,
                 successes=counters.successes + step.success,
                 cost=counters.cost + step.cost,
-                broken=counters.broken + broken,
+                physics_diverged=counters.physics_diverged + physics_diverged,
             ),
         )
 
-    def absorb(learner: Learner, step: Interaction) -> Learner:
+    def ingest(learner: Learner, step: Interaction) -> Learner:
         key = jax.random.split(learner.key, KEYS)[0]  # as `interact` would leave it
         return store(dataclasses.replace(learner, key=key), step)
 
@@ -203,8 +205,8 @@ def make_steps(
         key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
         state = learner.env_state
         observation = env.observe(state, params)
-        novice_action = propose(learner, key_propose, observation)
-        expert_action = advise(learner, key_expert, observation) if action is None else action
+        novice_action = sample_novice_action(learner, key_propose, observation)
+        expert_action = query_expert(learner, key_expert, observation) if action is None else action
         takeover = learner.takeover
         executed = jnp.where(takeover, expert_action, jnp.clip(novice_action, -1.0, 1.0))
         if algorithm.uses_predictions:
@@ -232,7 +234,9 @@ def make_steps(
         restarted = jax.lax.cond(
             done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset
         )
-        learner = store(dataclasses.replace(learner, key=key), interaction, outcome.broken)
+        learner = store(
+            dataclasses.replace(learner, key=key), interaction, outcome.physics_diverged
+        )
         # a takeover ends with its episode; the next decision waits for the grid
         learner = dataclasses.replace(learner, env_state=restarted, takeover=takeover & ~done)
         return learner, interaction
@@ -252,7 +256,7 @@ def make_steps(
         updated = dataclasses.replace(updated, learned=kept)
         return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
 
-    return Steps(init, propose, advise, interact, absorb, learn)
+    return Steps(init, sample_novice_action, query_expert, interact, ingest, learn)
 
 
 def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
@@ -267,5 +271,5 @@ def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
         "train/episodes": spent.episodes,
         "train/success_rate": spent.successes / jnp.maximum(spent.episodes, 1),
         "train/cost_per_step": spent.cost / steps,
-        "train/broken_episodes": spent.broken,
+        "train/physics_diverged_episodes": spent.physics_diverged,
     }

@@ -17,7 +17,7 @@ from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.interaction import Learner, make_steps, summarise
 from ppl_jax.losses import Metrics
-from ppl_jax.predictor import predict, selected_transition
+from ppl_jax.predictors import predict, selected_transition
 from ppl_jax.types import Env, Interaction, Trajectory
 
 PyTree = Any
@@ -28,7 +28,7 @@ class LiveFunctions(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        foresee: `foresee(learner, action, mine) -> Trajectory` [H] with positions where the world
+        predict_path: `predict_path(learner, action, mine) -> Trajectory` [H] with positions where the world
             can tell them: of `action` held where `mine`, else of what the novice would do now.
         play: `play(learner, takeover, action) -> (Learner, Interaction)`: one step, of `action` [A]
             where `takeover`, else of the novice.
@@ -36,19 +36,19 @@ class LiveFunctions(NamedTuple):
         fit: `fit(learner, updates) -> (Learner, Metrics)`: a static number of the updates that a
             method makes on demonstrations before its first step.
         restart: `restart(learner) -> Learner` at a new start, the episode left unfinished.
-        absorb: `absorb(learner, interactions [T], learning=True) -> (Learner, Metrics)`: take
+        ingest: `ingest(learner, interactions [T], learning=True) -> (Learner, Metrics)`: take
             recorded steps as if they were made now, with an update after each where `learning`.
             The settings and key of the session that was recorded give its policy again.
         algorithm: The method.
     """
 
     init: Callable[[jax.Array, HParams], Learner]
-    foresee: Callable[[Learner, jax.Array, jax.Array], Trajectory]
+    predict_path: Callable[[Learner, jax.Array, jax.Array], Trajectory]
     play: Callable[[Learner, jax.Array, jax.Array], tuple[Learner, Interaction]]
     learn: Callable[[Learner], tuple[Learner, Metrics]]
     fit: Callable[[Learner, int], tuple[Learner, Metrics]]
     restart: Callable[[Learner], Learner]
-    absorb: Callable[..., tuple[Learner, Metrics]]
+    ingest: Callable[..., tuple[Learner, Metrics]]
     algorithm: Algorithm
 
 
@@ -76,10 +76,12 @@ def make_live(
     transition = selected_transition(env, config.predictor)
     steps = make_steps(env, None, algorithm, config, params)
 
-    def foresee(learner: Learner, action: jax.Array, mine: jax.Array) -> Trajectory:
+    def predict_path(learner: Learner, action: jax.Array, mine: jax.Array) -> Trajectory:
         key_propose, key_predict = jax.random.split(learner.key)
         observation = env.observe(learner.env_state, params)
-        proposed = jnp.clip(steps.propose(learner, key_propose, observation), -1.0, 1.0)
+        proposed = jnp.clip(
+            steps.sample_novice_action(learner, key_propose, observation), -1.0, 1.0
+        )
         return predict(
             env,
             transition,
@@ -113,16 +115,16 @@ def make_live(
         _, state = env.reset(key_reset, params)
         return dataclasses.replace(learner, env_state=state, key=key, takeover=jnp.zeros((), bool))
 
-    def absorb(
+    def ingest(
         learner: Learner, interactions: Interaction, learning: bool = True
     ) -> tuple[Learner, Metrics]:
         before = learner.counters
 
         def step(learner: Learner, row: Interaction) -> tuple[Learner, Metrics]:
-            learner = steps.absorb(learner, row)
+            learner = steps.ingest(learner, row)
             return learn(learner) if learning else (learner, {})
 
         learner, metrics = jax.lax.scan(step, learner, interactions)
         return learner, summarise(metrics, before, learner.counters)
 
-    return LiveFunctions(steps.init, foresee, play, learn, fit, restart, absorb, algorithm)
+    return LiveFunctions(steps.init, predict_path, play, learn, fit, restart, ingest, algorithm)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy
 
-from ppl_jax.types import WorldSpec
+from ppl_jax.types import EnvSpec
 
 Params = Any
 Layers = list[tuple[jax.Array, jax.Array]]
@@ -44,13 +44,13 @@ class Network(NamedTuple):
     apply: Callable[..., jax.Array]
 
 
-def make_policy(spec: WorldSpec, hidden: tuple[int, ...]) -> Network:
+def make_policy(spec: EnvSpec, hidden: tuple[int, ...]) -> Network:
     """A deterministic policy: tanh at the end, actions [..., A] in [-1, 1]."""
     raw = make_raw(spec, hidden, spec.action_size)
     return Network(raw.init, lambda params, observation: jnp.tanh(raw.apply(params, observation)))
 
 
-def make_raw(spec: WorldSpec, hidden: tuple[int, ...], outputs: int) -> Network:
+def make_raw(spec: EnvSpec, hidden: tuple[int, ...], outputs: int) -> Network:
     """A network of the observation without anything behind its last layer."""
     module = _MLP(tuple(hidden), outputs)
     mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
@@ -64,7 +64,7 @@ def make_raw(spec: WorldSpec, hidden: tuple[int, ...], outputs: int) -> Network:
     return Network(init, apply)
 
 
-def make_critic(spec: WorldSpec, hidden: tuple[int, ...], count: int) -> Network:
+def make_critic(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Network:
     """`count` independent networks of observation and action: `apply(params, s, a)`, [count, ...].
 
     Parameters carry a leading [count] axis.
@@ -101,7 +101,7 @@ class Ensemble(NamedTuple):
     apply: Callable[[Params, jax.Array], jax.Array]
 
 
-def make_ensemble(spec: WorldSpec, hidden: tuple[int, ...], count: int) -> Ensemble:
+def make_ensemble(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Ensemble:
     """`count` deterministic policies."""
     raw = make_raw(spec, hidden, spec.action_size)
     shared = jax.vmap(raw.apply, in_axes=(0, None))

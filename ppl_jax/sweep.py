@@ -23,7 +23,7 @@ from ppl_jax.training import TrainFunctions, phases
 from ppl_jax.types import Env, PyTree
 
 
-class Curve(NamedTuple):
+class RunHistory(NamedTuple):
     """What a run leaves: one entry per evaluation, [P].
 
     Attributes:
@@ -37,8 +37,8 @@ class Curve(NamedTuple):
     diverged: jax.Array
 
 
-Lane = Callable[[jax.Array, HParams, PyTree], Curve]
-"""`lane(key, hparams, held_out_params) -> Curve`."""
+RunFn = Callable[[jax.Array, HParams, PyTree], RunHistory]
+"""`lane(key, hparams, held_out_params) -> RunHistory`."""
 
 
 def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
@@ -52,8 +52,8 @@ def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
     return steps if steps and steps[-1] == end else [*steps, end]
 
 
-def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> Lane:
-    """One whole run as a function: `Curve` at `evaluation_steps(config, every)`.
+def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> RunFn:
+    """One whole run as a function: `RunHistory` at `evaluation_steps(config, every)`.
 
     It trains what `ppl train` trains, number for number, but holds the evaluations in the
     program.
@@ -67,10 +67,10 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
     """
     interval = config.decision_interval
 
-    def one(curve: Curve) -> Curve:
+    def one(curve: RunHistory) -> RunHistory:
         return jax.tree.map(lambda leaf: leaf[None], curve)
 
-    def look(learner: Learner, held_out: PyTree) -> Curve:
+    def look(learner: Learner, held_out: PyTree) -> RunHistory:
         layers = functions.algorithm.policy(learner.algorithm)
         mean, scale = env.spec.observation_mean, env.spec.observation_scale
         policy = SavedPolicy(layers, "relu", "tanh", mean, scale)
@@ -79,12 +79,12 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
             return experts.act(policy, observation)
 
         episodes = make_evaluate(env, act)(held_out, jax.random.key(0))
-        return Curve(episodes, learner.counters, learner.diverged)
+        return RunHistory(episodes, learner.counters, learner.diverged)
 
-    def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
+    def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
         learner, curves = functions.init(key, hparams), []
 
-        def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, Curve]:
+        def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, RunHistory]:
             learner = functions.run_chunk(learner, steps // interval)[0]
             return learner, look(learner, held_out)
 
@@ -106,8 +106,10 @@ def make_lane(env: Env, functions: TrainFunctions, config: TrainConfig, every: i
     return lane
 
 
-def make_batch(lane: Lane, side_by_side: bool) -> Callable[[jax.Array, HParams, PyTree], Curve]:
-    """`batch(keys [B], hparams [B], held_out_params) -> Curve` with a leading [B].
+def make_batch(
+    lane: RunFn, side_by_side: bool
+) -> Callable[[jax.Array, HParams, PyTree], RunHistory]:
+    """`batch(keys [B], hparams [B], held_out_params) -> RunHistory` with a leading [B].
 
     Args:
         lane: One run.
@@ -116,7 +118,7 @@ def make_batch(lane: Lane, side_by_side: bool) -> Callable[[jax.Array, HParams, 
     if side_by_side:
         return jax.vmap(lane, in_axes=(0, 0, None))
 
-    def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> Curve:
+    def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
         return jax.lax.map(lambda run: lane(run[0], run[1], held_out), (keys, hparams))
 
     return one_after_another
@@ -133,7 +135,7 @@ def split(batch: PyTree, devices: list[Any]) -> PyTree:
     return jax.device_put(batch, NamedSharding(mesh, PartitionSpec("runs")))
 
 
-def lane_bytes(functions: TrainFunctions, hparams: HParams) -> int:
+def run_bytes(functions: TrainFunctions, hparams: HParams) -> int:
     """Memory that one run's state takes, bytes: its buffers, parameters and world."""
     learner = jax.eval_shape(functions.init, jax.random.key(0), hparams)
     leaves = jax.tree.leaves(learner)

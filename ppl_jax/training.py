@@ -22,7 +22,7 @@ from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.interaction import Learner, make_steps, summarise
 from ppl_jax.losses import Metrics
-from ppl_jax.predictor import predict, selected_transition
+from ppl_jax.predictors import predict, selected_transition
 from ppl_jax.types import DecisionPoint, Env, Expert
 
 PyTree = Any
@@ -83,14 +83,16 @@ def make_train(
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
     transition = selected_transition(env, config.predictor)
-    init, propose, advise, interact, _, learn = make_steps(env, expert, algorithm, config, params)
+    init, sample_novice_action, query_expert, interact, _, learn = make_steps(
+        env, expert, algorithm, config, params
+    )
     interval = config.decision_interval
     check_rounds(algorithm, config)
     density = getattr(expert, "log_density", None)
     if density is None:
-        if config.gate == "unlikely":
+        if config.gate == "action_probability":
             raise ValueError(
-                "gate 'unlikely' needs an expert with a density, such as a neural one: give one, "
+                "gate 'action_probability' needs an expert with a density, such as a neural one: give one, "
                 "or another gate"
             )
         density = lambda observation, action: jnp.nan  # noqa: E731
@@ -99,7 +101,7 @@ def make_train(
         """Whether the expert takes the next block."""
         key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
         observation = env.observe(learner.env_state, params)
-        action = propose(learner, key_propose, observation)
+        action = sample_novice_action(learner, key_propose, observation)
         roll = functools.partial(
             predict,
             env,
@@ -109,17 +111,17 @@ def make_train(
             action,
             params,
             config.prediction_horizon,
-            observe=algorithm.compares,
+            observe=algorithm.needs_expert_rollout,
         )
-        asked_again = config.gate_rollout == "closed_loop" or algorithm.compares
+        asked_again = config.gate_rollout == "closed_loop" or algorithm.needs_expert_rollout
         act = functools.partial(algorithm.act, learner.algorithm, key_act)
         point = DecisionPoint(
             observation=observation,
             novice_action=action,
-            expert_action=advise(learner, key_expert, observation),
+            expert_action=query_expert(learner, key_expert, observation),
             takeover=learner.takeover,
             trajectory=roll(act=act if asked_again else None),
-            experts=roll(expert=expert) if algorithm.compares else None,
+            experts=roll(expert=expert) if algorithm.needs_expert_rollout else None,
             log_density=jnp.asarray(density(observation, jnp.clip(action, -1.0, 1.0))),
         )
         return algorithm.decide(learner.algorithm, point, learner.hparams)

@@ -40,7 +40,7 @@ class Outcome:
     Attributes:
         reward, cost, progress, speed: Scalars (see `StepInfo`).
         terminated, truncated, success, unsafe: Booleans.
-        broken: The physics gave a value that is not finite; the state is the one before, and the
+        physics_diverged: The physics gave a value that is not finite; the state is the one before, and the
             episode ends here.
     """
 
@@ -52,7 +52,7 @@ class Outcome:
     unsafe: jax.Array
     progress: jax.Array
     speed: jax.Array
-    broken: jax.Array | bool = False
+    physics_diverged: jax.Array | bool = False
 
 
 @flax.struct.dataclass
@@ -64,7 +64,7 @@ class Trajectory:
         reward, speed: Of each predicted step.
         unsafe, success, terminated: Booleans.
         valid: The step was made: the prediction had not ended before it.
-        advice: [H, A] the expert's action at each predicted state, where it was asked, else None.
+        expert_actions: [H, A] the expert's action at each predicted state, where it was asked, else None.
         position: [H, P] where each predicted state is, where that was asked, else None.
     """
 
@@ -75,7 +75,7 @@ class Trajectory:
     success: jax.Array
     terminated: jax.Array
     valid: jax.Array
-    advice: jax.Array | None = None
+    expert_actions: jax.Array | None = None
     position: jax.Array | None = None
 
 
@@ -148,7 +148,7 @@ class PreferenceBatch:
     rejected_observation: jax.Array | None
 
 
-class WorldSpec(NamedTuple):
+class EnvSpec(NamedTuple):
     """What a network has to know of a world.
 
     Attributes:
@@ -167,15 +167,15 @@ class Env(Protocol):
     """A world. All methods are pure; write for one world and `vmap` outside.
 
     `params` is a traced struct; `default_params` is for training, `held_out_params` for
-    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`. `one_by_one`:
+    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`. `sequential_on_cpu`:
     on a CPU a batch of worlds is no faster than one after another, so that an evaluation had better
     leave out those whose episode has ended.
     """
 
     name: str
-    spec: WorldSpec
+    spec: EnvSpec
     max_episode_steps: int
-    one_by_one: bool
+    sequential_on_cpu: bool
     default_params: PyTree
     held_out_params: PyTree
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment
-from ppl_jax.types import Env, Outcome, WorldSpec
+from ppl_jax.types import Env, EnvSpec, Outcome
 
 TRAINING_SCENARIOS = range(1000)
 HELD_OUT_SCENARIOS = range(1_000_000, 1_000_050)
@@ -96,7 +96,7 @@ class FromBrax(Environment):
             raise ValueError(f"{name}: the observation must be one flat array, got {observation}")
         size = observation.shape[0]
         zeros, ones = np.zeros(size, np.float32), np.ones(size, np.float32)
-        self.spec = WorldSpec(size, inner.action_size, zeros, ones)
+        self.spec = EnvSpec(size, inner.action_size, zeros, ones)
         self.default_params = BraxParams(jnp.asarray(training, jnp.int32))
         self.held_out_params = BraxParams(jnp.asarray(held_out, jnp.int32))
 

@@ -35,9 +35,9 @@ from envs.driving.scenario import (
     Scenario,
     pack,
     stack,
-    take,
+    tree_index,
 )
-from ppl_jax.types import Expert, Outcome, WorldSpec
+from ppl_jax.types import EnvSpec, Expert, Outcome
 
 TRAINING_SCENARIOS = range(100, 150)
 HELD_OUT_SCENARIOS = range(1000, 1050)
@@ -184,7 +184,7 @@ def reward_and_cost(
     lanes = scenario.lanes
     on_reference = lanes.route[navigation.lane] == navigation.road
     lane_index = jnp.where(on_reference, navigation.lane, scenario.route_lane[navigation.road])
-    lane = take(lanes, lane_index)
+    lane = tree_index(lanes, lane_index)
     before, _ = lane_coordinates(lane, ego.last_pose[:2])
     speed = jnp.sqrt(jnp.sum(ego.velocity**2))
     reward = (
@@ -253,7 +253,7 @@ def push(
 
 def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
     """The ego standing 5 m along its lane, all traffic parked."""
-    lane = take(scenario.lanes, scenario.spawn_lane)
+    lane = tree_index(scenario.lanes, scenario.spawn_lane)
     long, zero = jnp.float32(SPAWN_LONG), jnp.zeros((), jnp.float32)
     position = lane_position(lane, long, zero)
     pose = jnp.append(position, lane_heading(lane, long))
@@ -279,7 +279,7 @@ class Driving(Environment):
     """MetaDrive-like driving as pure functions. Build one with `make_driving`."""
 
     name = "driving"
-    spec = WorldSpec(obs.SIZE, 2, obs.MEAN, obs.SCALE)
+    spec = EnvSpec(obs.SIZE, 2, obs.MEAN, obs.SCALE)
     max_episode_steps = HORIZON
 
     def __init__(self, default_params: DrivingParams, held_out_params: DrivingParams):
@@ -311,20 +311,20 @@ class Driving(Environment):
     def reset_to(self, index: jax.Array, key: jax.Array, params: DrivingParams) -> DrivingState:
         """The start of scenario `index` of the pool: standing, 5 m along its lane."""
         del key  # a scenario is deterministic
-        return take(params.starts, index)
+        return tree_index(params.starts, index)
 
     def reset(self, key: jax.Array, params: DrivingParams) -> tuple[jax.Array, DrivingState]:
         """A random scenario's start."""
         index = jax.random.randint(key, (), 0, self.scenario_count(params))
-        return params.start_observations[index], take(params.starts, index)
+        return params.start_observations[index], tree_index(params.starts, index)
 
     def transition(
         self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
     ) -> tuple[DrivingState, Outcome]:
         """One control step of 0.1 s, without reset."""
         del key  # the world is deterministic
-        scenario = take(params.scenarios, state.scenario)
-        lane = take(scenario.lanes, state.navigation.lane)
+        scenario = tree_index(params.scenarios, state.scenario)
+        lane = tree_index(scenario.lanes, state.navigation.lane)
         ego_long, _ = lane_coordinates(lane, state.ego.pose[:2])
         speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
         traffic = traffic_model.advance(
@@ -344,7 +344,7 @@ class Driving(Environment):
     ) -> tuple[DrivingState, Outcome]:
         """The paper's rule-based prediction step: kinematic bicycle, traffic frozen."""
         del key
-        scenario = take(params.scenarios, state.scenario)
+        scenario = tree_index(params.scenarios, state.scenario)
         ego = vehicle.drive_kinematic(
             state.ego, action, scenario.engine_force, scenario.brake_force
         )
@@ -404,7 +404,7 @@ class Driving(Environment):
 
     def observe(self, state: DrivingState, params: DrivingParams) -> jax.Array:
         """The 259 values (see `envs.driving.observation`)."""
-        return observe(take(params.scenarios, state.scenario), state)
+        return observe(tree_index(params.scenarios, state.scenario), state)
 
 
 def observe(scenario: Scenario, state: DrivingState) -> jax.Array:

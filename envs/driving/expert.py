@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from envs.driving import traffic as traffic_model
 from envs.driving.env import DrivingParams, DrivingState
 from envs.driving.geometry import lane_coordinates, lane_position, to_body
-from envs.driving.scenario import Scenario, take
+from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
 
 CRUISE_SPEED = 12.0  # m/s
@@ -71,7 +71,7 @@ def _point_ahead(
         over = (long > length) & (road < last)
         long = jnp.where(over, long - length, long)
         road = jnp.where(over, road + 1, road)
-    lane = take(scenario.lanes, scenario.route_lane[road])
+    lane = tree_index(scenario.lanes, scenario.route_lane[road])
     radius = jnp.maximum(lane.radius + lateral * lane.turn, 3.0)
     return lane_position(lane, long, lateral), lane.turn / radius
 
@@ -112,10 +112,10 @@ def drive(
         cruise_speed: m/s.
         tracks_wrecks: Wrecks are where they were pushed to; else forgotten once they lie still.
     """
-    scenario = take(params.scenarios, state.scenario)
+    scenario = tree_index(params.scenarios, state.scenario)
     lanes, ego = scenario.lanes, state.ego
     road = state.navigation.road
-    reference = take(lanes, scenario.route_lane[road])
+    reference = tree_index(lanes, scenario.route_lane[road])
     long, lateral = lane_coordinates(reference, ego.pose[:2])
     speed = jnp.sqrt(jnp.sum(ego.velocity**2))
     width = reference.width
@@ -213,7 +213,7 @@ def _things(
     along, across = objects.along, objects.across
     if tracks_wrecks:
         road = scenario.route_lane[jnp.maximum(route[vehicles : vehicles + boxes], 0)]
-        place = lane_coordinates(take(lanes, road), state.box_pose[:, :2])
+        place = lane_coordinates(tree_index(lanes, road), state.box_pose[:, :2])
         along, across = (
             x.at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
             for x, now in zip((along, across), place, strict=True)

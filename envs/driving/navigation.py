@@ -13,7 +13,7 @@ from envs.driving.geometry import (
     on_lanes,
     runs_along,
 )
-from envs.driving.scenario import Scenario, take
+from envs.driving.scenario import Scenario, tree_index
 
 CHECKPOINT_RANGE = 5.0  # m after a road's start within which the route moves on to it
 
@@ -105,7 +105,7 @@ def localise(
 
 def arrived(scenario: Scenario, navigation: Navigation, found: Localised) -> jax.Array:
     """Success: within 5 m of the end of the last lane, and laterally on the road."""
-    final = take(scenario.lanes, scenario.final_lane)
+    final = tree_index(scenario.lanes, scenario.final_lane)
     long, lateral = found.long[scenario.final_lane], found.lateral[scenario.final_lane]
     width = scenario.lanes.width[navigation.lane]
     size = scenario.route_size[navigation.road]

@@ -24,7 +24,7 @@ import numpy as np
 from envs.driving import lidar
 from envs.driving.geometry import lane_position, to_body, wrap
 from envs.driving.navigation import Navigation
-from envs.driving.scenario import Scenario, take
+from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import CONTROL_STEP, Ego
 
 SIZE = 19 + lidar.RAYS
@@ -40,7 +40,7 @@ _LARGEST_RADIUS, _LARGEST_ANGLE = 60.0, jnp.pi * 135.0 / 180.0
 
 def _checkpoint(scenario: Scenario, road: jax.Array, size: jax.Array, width: jax.Array, ego: Ego):
     """Five values on the end of a route road, [5]."""
-    lane = take(scenario.lanes, scenario.route_lane[road])
+    lane = tree_index(scenario.lanes, scenario.route_lane[road])
     middle = (size / 2 - 0.5) * width
     way = lane_position(lane, lane.length, middle) - ego.pose[:2]
     distance = jnp.sqrt(jnp.sum(way * way) + 1e-12)
@@ -82,7 +82,7 @@ def ego_features(
     width = lanes.width[navigation.lane]
     # MetaDrive takes the rightmost lane for this; beside an out-ramp it is not parallel
     rightmost = scenario.route_lane[navigation.road] + scenario.route_size[navigation.road] - 1
-    reference = take(lanes, rightmost)
+    reference = tree_index(lanes, rightmost)
     # the right-hand normal of the lane at the ego; on an arc it is radial
     radial = (ego.pose[:2] - reference.center) * reference.turn
     normal = jnp.where(

@@ -291,7 +291,7 @@ def stack(scenarios: Sequence[Scenario]) -> Scenario:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
 
 
-def take(pool: Scenario, index: jax.Array) -> Scenario:
+def tree_index(pool: Scenario, index: jax.Array) -> Scenario:
     """The scenario at `index` of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.driving.geometry import lane_heading, lane_position
-from envs.driving.scenario import Scenario, take
+from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import CONTROL_STEP
 
 REMOVED, PARKED, DRIVING = 0, 1, 2
@@ -79,7 +79,7 @@ def _at(table: jax.Array, leg: jax.Array) -> jax.Array:
 
 def poses(scenario: Scenario, traffic: Traffic) -> jax.Array:
     """World poses, [N, 3]."""
-    lane = take(scenario.lanes, _lane_index(scenario, traffic))
+    lane = tree_index(scenario.lanes, _lane_index(scenario, traffic))
     position = lane_position(lane, traffic.long, traffic.lateral)
     lean = jnp.arctan2(traffic.slide, jnp.maximum(traffic.speed, 1.0))
     return jnp.concatenate([position, (lane_heading(lane, traffic.long) - lean)[:, None]], -1)

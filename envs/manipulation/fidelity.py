@@ -29,9 +29,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.compiler import set_xla_flags
-from envs.manipulation import nut, small, wiping
-from envs.manipulation.arm import frames
-from envs.manipulation.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, WIPING_BASE
+from envs.manipulation.physics.analytic import unrolled_linalg
+from envs.manipulation.physics.analytic.arm import frames
+from envs.manipulation.scenes.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, WIPING_BASE
+from envs.manipulation.tasks import nut, wiping
 
 FREE_STEPS, WINDOW = 20, 10
 _LONGEST = 250  # steps that a compiled replay holds; longer recordings are replayed in parts
@@ -156,7 +157,7 @@ def _grip_site(env: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
 
     def one(joints: jax.Array, speeds: jax.Array) -> tuple[jax.Array, jax.Array]:
         at = frames(list(joints - TIMESTEP * speeds), tool)
-        return jnp.stack(at.position) + jnp.array(base), small.array(at.rotation).T
+        return jnp.stack(at.position) + jnp.array(base), unrolled_linalg.array(at.rotation).T
 
     places, turns = jax.jit(jax.vmap(one))(states.joints, states.speeds)
     return np.asarray(places), np.asarray(turns)
@@ -204,7 +205,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 @jax.vmap
 def _push_up(state: wiping.WipingState) -> jax.Array:
     """The table's push on the wiper, N: the wrist's sensor, turned up, and the wiper's weight."""
-    turn = small.array(wiping.lagged_frames(state, WIPER).rotation)
+    turn = unrolled_linalg.array(wiping.lagged_frames(state, WIPER).rotation)
     return (-turn.T @ state.force)[2] + 9.81 * WIPER.mass
 
 

@@ -19,7 +19,7 @@ from ppl_jax import buffers
 from ppl_jax.algorithms import Algorithm, register
 from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import bc_loss
 from ppl_jax.networks import layers, make_policy
 
@@ -70,7 +70,7 @@ def make_focused(spec, config):
         store=store,
         update=update,
         policy=lambda state: layers(state.learned.average),  # what is evaluated and exported
-        compares=config.gate in COMPARING,
+        needs_expert_rollout=config.gate in COMPARING,
     )
 
 

@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.runtime import UserError
-from experiments.train import RunSettings, build_world, check, open_folder
-from experiments.ui.session import Question, Session, Sitting
+from experiments.engine.run import RunSettings, build_world, check, open_folder
+from experiments.engine.run_folder import RunFolder
+from experiments.engine.runtime import UserError
+from experiments.ui.session import Question, Session, SessionConfig
 from experiments.ui.views import RATES
-from ppl_jax.runlog import RunFolder
 
 PARTICIPANT = re.compile(r"[A-Za-z0-9_-]{0,32}")
 LONGEST_TEXT = 20_000  # letters of a consent text
@@ -22,7 +22,7 @@ def play(
     settings: RunSettings,
     out: Path,
     resume: bool,
-    sitting: Sitting,
+    sitting: SessionConfig,
     manual_episodes: int = 0,
     host: str = "127.0.0.1",
     port: int = 8765,
@@ -47,7 +47,7 @@ def play(
         raise UserError(
             f"participant must be at most 32 letters, digits, - and _, got {sitting.participant!r}"
         )
-    from experiments.ui.trainee import Trainee
+    from experiments.ui.trainer import InteractiveTrainer
     from experiments.ui.views import make_view
 
     served = server.listen(host, port, exposed)
@@ -57,7 +57,7 @@ def play(
         view = make_view(env, hub.picture)
         try:
             folder = RunFolder(out)
-            trainee = Trainee(settings, folder, env, view.place, manual_episodes)
+            trainee = InteractiveTrainer(settings, folder, env, view.place, manual_episodes)
             about = {"participant": sitting.participant, "manual_episodes": manual_episodes}
             open_folder(folder, settings.as_json() | about, resume)
         except ValueError as error:

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.evaluate import make_world
-from experiments.runtime import UserError
-from experiments.ui import recording
+from experiments.engine import recording
+from experiments.engine.evaluate import make_world
+from experiments.engine.runtime import UserError
 from experiments.ui.play import web
 from experiments.ui.protocol import Message, Order, Seek
 from experiments.ui.session import Clock

@@ -28,7 +28,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from experiments.runtime import UserError
+from experiments.engine.runtime import UserError
 from experiments.ui.protocol import LONGEST, Allowance, Malformed, Message, Order, parse
 
 PAGE = Path(__file__).parent / "page"
@@ -54,7 +54,7 @@ HEADERS = {
 }
 
 
-class Performance(Protocol):
+class SessionBackend(Protocol):
     """What the server shows: a session, or the replay of one.
 
     Attributes:
@@ -125,7 +125,7 @@ class Hub:
         self.secret, self.token = secrets.token_urlsafe(32), None
         self.pages: dict[WebSocket, _Mailbox] = {}
         self.controller: WebSocket | None = None
-        self.performance: Performance | None = None
+        self.performance: SessionBackend | None = None
         self.loop: asyncio.AbstractEventLoop | None = None
         self.kept: dict[str, str | bytes] = {}
         self.rejected = 0
@@ -327,7 +327,7 @@ def listen(host: str, port: int, exposed: bool) -> socket.socket:
 
 def serve(
     hub: Hub,
-    performance: Performance,
+    performance: SessionBackend,
     served: socket.socket,
     exposed: bool = False,
     tell: Callable[[str], None] = print,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from experiments.ui.protocol import Answers, Consent, Input, Message, Order
-from experiments.ui.trainee import Trainee
+from experiments.ui.trainer import InteractiveTrainer
 from experiments.ui.views import Shown, View
 from ppl_jax.interaction import Learner
 from ppl_jax.types import Interaction
@@ -44,7 +44,7 @@ class Question:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sitting:
+class SessionConfig:
     """How a session goes.
 
     Attributes:
@@ -102,9 +102,9 @@ class Session:
 
     def __init__(
         self,
-        trainee: Trainee,
+        trainee: InteractiveTrainer,
         view: View,
-        sitting: Sitting,
+        sitting: SessionConfig,
         publish: Publish,
         tell: Callable[[str], None] = print,
     ):
@@ -325,7 +325,7 @@ class Session:
     def _training_tick(self, takeover: bool, action: np.ndarray, about: dict[str, Any]) -> None:
         trainee = self.trainee
         takeover = takeover or trainee.manual
-        mine = trainee.foresee(trainee.learner, action).path if takeover else None
+        mine = trainee.predict_path(trainee.learner, action).path if takeover else None
         step = trainee.step(takeover, action, about)
         self._show(trainee.learner, step, takeover, mine)
         if trainee.fits_next:
@@ -342,7 +342,7 @@ class Session:
 
     def _practice_tick(self, action: np.ndarray) -> None:
         assert self._spare is not None
-        mine = self.trainee.foresee(self._spare, action).path
+        mine = self.trainee.predict_path(self._spare, action).path
         self._spare, step = self.trainee.practise(self._spare, True, action)
         done = bool(step.terminated | step.truncated)
         self._show(self._spare, step, True, mine)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from experiments.runtime import UserError
+from experiments.engine.runtime import UserError
 from ppl_jax.types import Env
 
 RATES = {"driving": 10.0, "table_wiping": 20.0, "nut_assembly": 20.0}  # Hz, of the worlds
@@ -102,10 +102,10 @@ class DrivingView:
 
     def scene(self, state: Any) -> dict[str, Any]:
         """Road surfaces, the route's among them, lines and what stands there."""
-        from envs.driving.scenario import take
-        from envs.rendering import CENTER_LINE, Scene
+        from envs.driving.rendering import CENTER_LINE, Scene
+        from envs.driving.scenario import tree_index
 
-        self.scenario = take(self.env.default_params.scenarios, int(state.scenario))
+        self.scenario = tree_index(self.env.default_params.scenarios, int(state.scenario))
         scene = Scene(self.scenario)
         scenario = scene.scenario
         lanes, objects = scenario.lanes, scenario.objects
@@ -128,7 +128,7 @@ class DrivingView:
     def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
         """Poses of everything that moves."""
         from envs.driving import traffic as traffic_model
-        from envs.rendering import traffic_poses
+        from envs.driving.rendering import traffic_poses
 
         ego, speed = np.asarray(state.ego.pose), float(np.hypot(*np.asarray(state.ego.velocity)))
         cars = np.asarray(traffic_poses(self.scenario, state.traffic))
@@ -166,7 +166,7 @@ class ArmView:
 
     def __init__(self, env: Any, picture: Picture):
         self.env, self._picture = env, picture
-        from envs.manipulation.drawing import CAMERAS
+        from envs.manipulation.rendering import CAMERAS
 
         self.azimuth = CAMERAS[env.name]["azimuth"]
         context = multiprocessing.get_context("spawn")
@@ -227,7 +227,7 @@ def _paint(pipe: Any, name: str) -> None:
     from PIL import Image
 
     from envs import make
-    from envs.manipulation.drawing import ArmPaths, ArmScene
+    from envs.manipulation.rendering import ArmPaths, ArmScene
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     scene = ArmScene(make(name), PICTURE, smooth=False)

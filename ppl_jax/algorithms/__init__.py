@@ -23,7 +23,7 @@ Changes = Callable[[str], Mapping[str, Any]]
 """`changes(task)`: fields of `TrainConfig` and `HParams` that a method sets otherwise."""
 
 
-class Method(NamedTuple):
+class AlgorithmSpec(NamedTuple):
     """A registered method.
 
     Attributes:
@@ -74,7 +74,7 @@ def _thrifty(task: str) -> Mapping[str, Any]:
     return {**_warmed_up(task), "batch_size": BATCH_OF_CRITICS}
 
 
-_METHODS: dict[str, Method] = {}
+_METHODS: dict[str, AlgorithmSpec] = {}
 
 
 def register(
@@ -104,7 +104,7 @@ def register(
     unknown = {*function("driving"), *(tuned or {})} - known
     if unknown:
         raise ValueError(f"algorithm {name!r} changes unknown fields: {', '.join(sorted(unknown))}")
-    _METHODS[name] = Method(make, function, tuned or {}, variant)
+    _METHODS[name] = AlgorithmSpec(make, function, tuned or {}, variant)
 
 
 # `tuned` is the best of four settings each, found by `ppl tune driving --seeds 1` on training
@@ -136,7 +136,7 @@ def registered(variants: bool = True) -> list[str]:
     return [name for name, method in _METHODS.items() if variants or not method.variant]
 
 
-def method(name: str) -> Method:
+def method(name: str) -> AlgorithmSpec:
     """A method by name.
 
     Raises:
@@ -163,4 +163,12 @@ def settings(name: str, task: str, preset: str = "default") -> tuple[TrainConfig
     return config, hparams
 
 
-__all__ = ["Algorithm", "MakeAlgorithm", "Method", "method", "register", "registered", "settings"]
+__all__ = [
+    "Algorithm",
+    "AlgorithmSpec",
+    "MakeAlgorithm",
+    "method",
+    "register",
+    "registered",
+    "settings",
+]

@@ -13,7 +13,7 @@ import optax
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers
-from ppl_jax.types import DecisionPoint, Interaction, WorldSpec
+from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 PyTree = Any
 
@@ -34,9 +34,9 @@ class Algorithm(NamedTuple):
         policy: `policy(state) -> Layers`: the deterministic policy that is evaluated, saved and
             exported (ReLU between layers, tanh at the end, input centred and scaled).
         uses_predictions: Whether `store` reads `interaction.predicted`.
-        compares: Whether `decide` reads the expert's own prediction.
+        needs_expert_rollout: Whether `decide` reads the expert's own prediction.
         update_every: Steps between updates: 1, or a multiple of `decision_interval`.
-        asks: Whether an expert decides when to take over; not so where the method's own rule does,
+        supports_human: Whether an expert decides when to take over; not so where the method's own rule does,
             or nobody.
         fit: Update of the phase between demonstrations and the first step; `update` where None.
     """
@@ -49,13 +49,13 @@ class Algorithm(NamedTuple):
     update: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]]
     policy: Callable[[PyTree], Layers]
     uses_predictions: bool = False
-    compares: bool = False
+    needs_expert_rollout: bool = False
     update_every: int = 1
-    asks: bool = True
+    supports_human: bool = True
     fit: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]] | None = None
 
 
-MakeAlgorithm = Callable[[WorldSpec, TrainConfig], Algorithm]
+MakeAlgorithm = Callable[[EnvSpec, TrainConfig], Algorithm]
 """`make(spec, config) -> Algorithm`."""
 
 _ADAM = optax.scale_by_adam()
@@ -91,7 +91,7 @@ def adam_step(
     grads: PyTree,
     learning_rate: jax.Array | float,
     do: jax.Array | bool = True,
-    target_rate: jax.Array | float | None = None,
+    polyak_tau: jax.Array | float | None = None,
 ) -> Learned:
     """One step of Adam with a traced learning rate where `do`, else nothing.
 
@@ -100,18 +100,18 @@ def adam_step(
         grads: Like `learned.params`.
         learning_rate: Of Adam.
         do: Scalar.
-        target_rate: tau of a target network: average <- (1 - tau) average + tau params. Where None
+        polyak_tau: tau of a target network: average <- (1 - tau) average + tau params. Where None
             the average is a policy's, with `AVERAGING` for decay.
     """
 
     def step(learned: Learned) -> Learned:
         updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, learned.params, updates)
-        if target_rate is None:
+        if polyak_tau is None:
             count = learned.updates + 1.0
             decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
         else:
-            decay = 1.0 - target_rate
+            decay = 1.0 - polyak_tau
         average = jax.tree.map(
             lambda old, new: decay * old + (1 - decay) * new, learned.average, params
         )

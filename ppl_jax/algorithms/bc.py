@@ -13,10 +13,10 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import Gate, never
+from ppl_jax.gates import Gate, never
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Layers, layers, make_policy
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -32,12 +32,12 @@ class ClonerState:
     human_buffer: RingBuffer
 
 
-def make_bc(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_bc(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """BC: `demonstrations` steps of the expert, then `offline_updates`, and that is all."""
     return make_cloner("bc", spec, config, never)
 
 
-def make_cloner(name: str, spec: WorldSpec, config: TrainConfig, decide: Gate) -> Algorithm:
+def make_cloner(name: str, spec: EnvSpec, config: TrainConfig, decide: Gate) -> Algorithm:
     """A policy that clones every step under the expert's control, whoever gave it control.
 
     L = -E_{D_h}[ log pi(a_h|s) ]
@@ -75,5 +75,7 @@ def make_cloner(name: str, spec: WorldSpec, config: TrainConfig, decide: Gate) -
     def policy_layers(state: ClonerState) -> Layers:
         return layers(state.learned.average)
 
-    asks = decide is not never
-    return Algorithm(name, init, act, decide, store, update, policy_layers, asks=asks)
+    supports_human = decide is not never
+    return Algorithm(
+        name, init, act, decide, store, update, policy_layers, supports_human=supports_human
+    )

@@ -14,17 +14,17 @@ from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_lear
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 OTHERS = 3  # uniform random actions that the expert's is held against
 POLICY_DELAY = 2
 
 
 @flax.struct.dataclass
-class Judged:
+class LabelledSteps:
     """A step of the novice: `good` if no intervention followed within the window."""
 
     observation: jax.Array
@@ -33,7 +33,7 @@ class Judged:
 
 
 @flax.struct.dataclass
-class Waiting:
+class PendingSteps:
     """The novice's last steps, not judged yet, newest last.
 
     Attributes:
@@ -53,17 +53,19 @@ class EILState:
     Attributes:
         learned: Policy and twin action values (without targets: nothing is bootstrapped).
         human_buffer: (observation, expert's action, novice's action) under the expert's control.
-        robot_buffer: `Judged` steps of the novice.
+        robot_buffer: `LabelledSteps` steps of the novice.
         waiting: Those still to be judged.
     """
 
     learned: ActorCritic
     human_buffer: RingBuffer
     robot_buffer: RingBuffer
-    waiting: Waiting
+    waiting: PendingSteps
 
 
-def judge(robot: RingBuffer, waiting: Waiting, step: Interaction) -> tuple[RingBuffer, Waiting]:
+def judge(
+    robot: RingBuffer, waiting: PendingSteps, step: Interaction
+) -> tuple[RingBuffer, PendingSteps]:
     """Take one step in: the last W before an intervention are bad, all others good.
 
     A step is judged once W more have gone by, its episode has ended, or the expert has taken over.
@@ -79,9 +81,9 @@ def judge(robot: RingBuffer, waiting: Waiting, step: Interaction) -> tuple[RingB
     observation = jnp.concatenate([waiting.observation, step.observation[None]])
     action = jnp.concatenate([waiting.action, step.executed_action[None]])
     good = jnp.broadcast_to(~step.takeover_start, chosen.shape)
-    robot = buffers.add(robot, Judged(observation, action, good), chosen)
+    robot = buffers.add(robot, LabelledSteps(observation, action, good), chosen)
     count = jnp.where(novice & ~done, jnp.minimum(waiting.count + 1, window), 0)
-    kept = Waiting(
+    kept = PendingSteps(
         jnp.where(novice, observation[1:], waiting.observation),
         jnp.where(novice, action[1:], waiting.action),
         count,
@@ -120,7 +122,7 @@ def hinge_losses(
     return good_loss, bad_loss, compared
 
 
-def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """EIL: being left alone says that a step was good enough, an intervention that it was not.
 
         L_Q = l_good + l_bad + l_C (`hinge_losses`),  L_mu = -E[ Q_1(s, mu(s)) ]
@@ -142,9 +144,9 @@ def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
             ),
             human_buffer=buffers.init_buffer((observation, action, action), rows),
             robot_buffer=buffers.init_buffer(
-                Judged(observation, action, jnp.zeros((), bool)), rows
+                LabelledSteps(observation, action, jnp.zeros((), bool)), rows
             ),
-            waiting=Waiting(
+            waiting=PendingSteps(
                 jnp.zeros((window, spec.observation_size)),
                 jnp.zeros((window, spec.action_size)),
                 jnp.zeros((), jnp.int32),
@@ -167,7 +169,12 @@ def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         )
 
     def critic_loss(
-        params: Any, human: Any, judged: Judged, weight: jax.Array, others: jax.Array, margin: Any
+        params: Any,
+        human: Any,
+        judged: LabelledSteps,
+        weight: jax.Array,
+        others: jax.Array,
+        margin: Any,
     ) -> tuple[jax.Array, Metrics]:
         observation, expert_action, _ = human
         size = (OTHERS + 1, *observation.shape)
@@ -183,7 +190,12 @@ def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return weight * (good + bad) + compared, metrics
 
     def actor_loss(
-        params: Any, critics: Any, human: Any, judged: Judged, weight: jax.Array, hparams: HParams
+        params: Any,
+        critics: Any,
+        human: Any,
+        judged: LabelledSteps,
+        weight: jax.Array,
+        hparams: HParams,
     ) -> jax.Array:
         observation, expert_action, _ = human
         observation = jnp.concatenate([observation, judged.observation])
@@ -224,5 +236,14 @@ def make_eil(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return layers(state.learned.actor.average)
 
     gate = make_gate(config.gate, spec.observation_scale)
-    compares = config.gate in COMPARING
-    return Algorithm("eil", init, act, gate, store, update, policy_layers, compares=compares)
+    needs_expert_rollout = config.gate in COMPARING
+    return Algorithm(
+        "eil",
+        init,
+        act,
+        gate,
+        store,
+        update,
+        policy_layers,
+        needs_expert_rollout=needs_expert_rollout,
+    )

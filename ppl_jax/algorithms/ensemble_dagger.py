@@ -15,7 +15,7 @@ from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Ensemble, Layers, ensemble_layers, make_ensemble
-from ppl_jax.types import DecisionPoint, Interaction, WorldSpec
+from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -45,7 +45,7 @@ class EnsembleState:
     human: Bootstrap
 
 
-def init_bootstrap(key: jax.Array, spec: WorldSpec, config: TrainConfig) -> Bootstrap:
+def init_bootstrap(key: jax.Array, spec: EnvSpec, config: TrainConfig) -> Bootstrap:
     """Empty data sets; which row goes to which member how often is drawn beforehand."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     rows = min(config.human_capacity, config.total_steps)
@@ -87,15 +87,15 @@ def clone_members(
     return adam_step(learned, grads, hparams.learning_rate, count > 0), metrics
 
 
-def doubt(ensemble: Ensemble, params: Any, observation: jax.Array) -> jax.Array:
+def ensemble_variance(ensemble: Ensemble, params: Any, observation: jax.Array) -> jax.Array:
     """Variance of the members' actions, averaged over action dimensions, [..., O] -> [...]."""
     return jnp.mean(jnp.var(ensemble.members(params, observation), axis=0), -1)
 
 
-def make_ensemble_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_ensemble_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """Ensemble-DAgger: the novice acts where it is sure and agrees with the expert.
 
-        novice in control  iff  doubt(s) <= max_doubt  and  |a_n - a_h|^2 <= max_discrepancy
+        novice in control  iff  ensemble_variance(s) <= max_ensemble_variance  and  |a_n - a_h|^2 <= max_discrepancy
 
     with a_n the ensemble's action. Only steps under the expert's control are learnt from, the
     demonstrations at the start included, and count as human data.
@@ -112,7 +112,10 @@ def make_ensemble_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return ensemble.apply(state.learned.params, observation)
 
     def decide(state: EnsembleState, point: DecisionPoint, hparams: HParams) -> jax.Array:
-        unsure = doubt(ensemble, state.learned.params, point.observation) > hparams.max_doubt
+        unsure = (
+            ensemble_variance(ensemble, state.learned.params, point.observation)
+            > hparams.max_ensemble_variance
+        )
         apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
         return unsure | (apart > hparams.max_discrepancy)
 
@@ -129,4 +132,6 @@ def make_ensemble_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: EnsembleState) -> Layers:
         return ensemble_layers(state.learned.average)
 
-    return Algorithm("ensemble_dagger", init, act, decide, store, update, policy_layers, asks=False)
+    return Algorithm(
+        "ensemble_dagger", init, act, decide, store, update, policy_layers, supports_human=False
+    )

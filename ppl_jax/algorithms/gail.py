@@ -14,11 +14,11 @@ from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
-from ppl_jax.intervention import never
+from ppl_jax.gates import never
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy, make_raw
-from ppl_jax.policy_gradient import advantages, clipped_loss
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.ppo.losses import advantages, clipped_loss
+from ppl_jax.types import EnvSpec, Interaction
 
 GAE_LAMBDA = 0.95
 EPOCHS = 5
@@ -82,7 +82,7 @@ def imitation_reward(logit: jax.Array, correction: jax.Array | float) -> jax.Arr
     return jax.nn.softplus(logit) - correction * jax.nn.softplus(-logit)
 
 
-def make_gail(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """GAIL: a discriminator between demonstrations and the novice is the reward of PPO.
 
     Nobody takes over. With `offline_updates` the policy's mean clones the demonstrations first.
@@ -243,6 +243,6 @@ def make_gail(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         update,
         policy_layers,
         update_every=config.rollout_steps,
-        asks=False,
+        supports_human=False,
         fit=fit,
     )

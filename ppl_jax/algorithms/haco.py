@@ -16,10 +16,10 @@ from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import squashed_gaussian
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_raw
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -78,7 +78,7 @@ def policy_loss(
     return jnp.mean(weight * (alpha * log_pi - jnp.min(values, 0) + jnp.min(costs, 0)))
 
 
-def make_haco(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_haco(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """HACO: soft actor-critic without a reward, and a price on being overruled.
 
         y     = gamma (1 - terminated) [min_k Q'_k(s', a') - alpha log pi(a'|s')],  a' ~ pi(s')
@@ -93,7 +93,7 @@ def make_haco(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     return _make("haco", spec, config, ported=False)
 
 
-def make_haco_port(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_haco_port(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """HACO as the PVP4Real repository ports it.
 
     C is paid in every step under the expert's control, Q_int is learnt at the executed action,
@@ -102,7 +102,7 @@ def make_haco_port(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     return _make("haco_port", spec, config, ported=True)
 
 
-def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algorithm:
+def _make(name: str, spec: EnvSpec, config: TrainConfig, ported: bool) -> Algorithm:
     actions = spec.action_size
     network = make_raw(spec, config.hidden, 2 * actions)
     critic = make_critic(spec, config.hidden, 2)
@@ -118,12 +118,14 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         )
         return HACOState(learned, init_replay(spec, config))
 
-    def propose(params: Any, key: jax.Array, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def sample_novice_action(
+        params: Any, key: jax.Array, observation: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         mean, log_std = jnp.split(network.apply(params, observation), 2, -1)
         return squashed_gaussian(key, mean, log_std)
 
     def act(state: HACOState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        return propose(state.learned.actor.params, key, observation)[0]
+        return sample_novice_action(state.learned.actor.params, key, observation)[0]
 
     def store(state: HACOState, step: Interaction, hparams: HParams) -> HACOState:
         del hparams
@@ -152,7 +154,7 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         observation: jax.Array,
         weight: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        action, log_pi = propose(params, key, observation)
+        action, log_pi = sample_novice_action(params, key, observation)
         values = critic.apply(learned.value.params, observation, action)
         costs = critic.apply(learned.cost.params, observation, action)
         alpha = jnp.exp(learned.log_alpha.params)
@@ -164,7 +166,9 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         has_data = buffers.size(state.replay.human) > 0
         learned = state.learned
         step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)
-        action, log_pi = propose(learned.actor.params, key_next, batch.next_observation)
+        action, log_pi = sample_novice_action(
+            learned.actor.params, key_next, batch.next_observation
+        )
         alpha = jnp.exp(learned.log_alpha.params)
         values = critic.apply(learned.value.average, batch.next_observation, action)
         costs = critic.apply(learned.cost.average, batch.next_observation, action)
@@ -177,14 +181,14 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
             weight,
             hparams,
         )
-        value = step(learned.value, grads, target_rate=hparams.target_rate)
+        value = step(learned.value, grads, polyak_tau=hparams.polyak_tau)
         loss_cost, grads = jax.value_and_grad(cost_loss)(
             learned.cost.params,
             batch,
             td_target(costs, batch.terminated, hparams.discount, paid=price),
             weight,
         )
-        cost = step(learned.cost, grads, target_rate=hparams.target_rate)
+        cost = step(learned.cost, grads, polyak_tau=hparams.polyak_tau)
         learned = dataclasses.replace(learned, value=value, cost=cost)
         (loss_actor, mean_log_pi), grads = jax.value_and_grad(actor_loss, has_aux=True)(
             learned.actor.params, learned, key_actor, batch.observation, weight
@@ -201,5 +205,14 @@ def _make(name: str, spec: WorldSpec, config: TrainConfig, ported: bool) -> Algo
         return [*before, (w[:, :actions], b[:actions])]  # the mean alone
 
     gate = make_gate(config.gate, spec.observation_scale)
-    compares = config.gate in COMPARING
-    return Algorithm(name, init, act, gate, store, update, policy_layers, compares=compares)
+    needs_expert_rollout = config.gate in COMPARING
+    return Algorithm(
+        name,
+        init,
+        act,
+        gate,
+        store,
+        update,
+        policy_layers,
+        needs_expert_rollout=needs_expert_rollout,
+    )

@@ -5,11 +5,11 @@ from __future__ import annotations
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.bc import make_cloner
 from ppl_jax.config import TrainConfig
-from ppl_jax.intervention import COMPARING, make_gate
-from ppl_jax.types import WorldSpec
+from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.types import EnvSpec
 
 
-def make_hg_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_hg_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """HG-DAgger with the shared gate in the human's place.
 
     Only (s, a_h) under the expert's control is learnt from. Updated at every step rather than
@@ -17,4 +17,6 @@ def make_hg_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
     loss.
     """
     gate = make_gate(config.gate, spec.observation_scale)
-    return make_cloner("hg_dagger", spec, config, gate)._replace(compares=config.gate in COMPARING)
+    return make_cloner("hg_dagger", spec, config, gate)._replace(
+        needs_expert_rollout=config.gate in COMPARING
+    )

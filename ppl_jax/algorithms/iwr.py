@@ -13,10 +13,10 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Layers, layers, make_policy
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -32,7 +32,7 @@ class IWRState:
     steps: SplitBuffer
 
 
-def make_iwr(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_iwr(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """IWR: clone interventions and the novice's own steps, both with the same mass.
 
         L = -1/2 E_{D_I}[ log pi(a_h|s) ] - 1/2 E_{D_R}[ log pi(a_n|s) ]
@@ -74,5 +74,14 @@ def make_iwr(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return layers(state.learned.average)
 
     gate = make_gate(config.gate, spec.observation_scale)
-    compares = config.gate in COMPARING
-    return Algorithm("iwr", init, act, gate, store, update, policy_layers, compares=compares)
+    needs_expert_rollout = config.gate in COMPARING
+    return Algorithm(
+        "iwr",
+        init,
+        act,
+        gate,
+        store,
+        update,
+        policy_layers,
+        needs_expert_rollout=needs_expert_rollout,
+    )

@@ -14,7 +14,7 @@ from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import (
     NEEDS_REFERENCE,
     Metrics,
@@ -24,7 +24,7 @@ from ppl_jax.losses import (
 )
 from ppl_jax.networks import Layers, layers, make_policy
 from ppl_jax.preference import preference_pairs
-from ppl_jax.types import Interaction, PreferenceBatch, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction, PreferenceBatch
 
 Reference = Callable[[jax.Array], jax.Array]
 """A frozen policy, `reference(observation [B, O]) -> action [B, A]`."""
@@ -50,7 +50,7 @@ class PPLState:
     horizon: horizon.Horizon | None
 
 
-def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None = None) -> Algorithm:
+def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = None) -> Algorithm:
     """PPL: clone the expert, and prefer its action on the states the novice would have come to.
 
         L = preference_weight L_pref + bc_weight L_bc                    (see `ppl_jax.losses`)
@@ -95,12 +95,12 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
     def watch(state: PPLState, step: Interaction) -> PPLState:
         """What the expert would do at the predicted states, where it was asked."""
         predicted = step.predicted
-        if state.horizon is None or predicted.advice is None:
+        if state.horizon is None or predicted.expert_actions is None:
             return state
         found = horizon.measure(
             step.observation,
             predicted.observation,
-            predicted.advice,
+            predicted.expert_actions,
             step.expert_action,
             step.novice_action,
             jnp.asarray(spec.observation_scale),
@@ -197,5 +197,5 @@ def make_ppl(spec: WorldSpec, config: TrainConfig, reference: Reference | None =
         update,
         policy_layers,
         uses_predictions=True,
-        compares=config.gate in COMPARING,
+        needs_expert_rollout=config.gate in COMPARING,
     )

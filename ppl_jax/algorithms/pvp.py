@@ -15,10 +15,10 @@ from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
-from ppl_jax.intervention import COMPARING, make_gate
+from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5  # TD3's, on the target policy's action
 POLICY_DELAY = 2  # TD3's: updates of the critic per update of the actor
@@ -59,7 +59,7 @@ def policy_loss(
     return -jnp.mean(weight * (value + bc_weight * takeover * log_pi))
 
 
-def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_pvp(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """PVP on TD3: the expert's actions are worth 1, what it overruled -1, and values spread.
 
         L_Q  = L_PV + E[(Q(s, a_b) - y)^2],   y = gamma (1 - terminated) min_k Q'_k(s', mu'(s') + e)
@@ -116,7 +116,7 @@ def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         )
         target = td_target(values, batch.terminated, hparams.discount)
         grads, metrics = jax.grad(critic_loss, has_aux=True)(critics.params, batch, target, weight)
-        critics = adam_step(critics, grads, hparams.learning_rate, has_data, hparams.target_rate)
+        critics = adam_step(critics, grads, hparams.learning_rate, has_data, hparams.polyak_tau)
 
         def improve(actor: Any) -> Any:
             grads = jax.grad(actor_loss)(actor.params, critics.params, batch, weight, hparams)
@@ -131,5 +131,14 @@ def make_pvp(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return layers(state.learned.actor.average)
 
     gate = make_gate(config.gate, spec.observation_scale)
-    compares = config.gate in COMPARING
-    return Algorithm("pvp", init, act, gate, store, update, policy_layers, compares=compares)
+    needs_expert_rollout = config.gate in COMPARING
+    return Algorithm(
+        "pvp",
+        init,
+        act,
+        gate,
+        store,
+        update,
+        policy_layers,
+        needs_expert_rollout=needs_expert_rollout,
+    )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from ppl_jax import buffers
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import TrainConfig
-from ppl_jax.types import Interaction, WorldSpec
+from ppl_jax.types import EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -55,7 +55,7 @@ def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array
     return jnp.sum(jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2, -1))
 
 
-def init_replay(spec: WorldSpec, config: TrainConfig) -> SplitBuffer:
+def init_replay(spec: EnvSpec, config: TrainConfig) -> SplitBuffer:
     """Empty buffers of the expert's and the novice's steps."""
     observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
     no = jnp.zeros((), bool)

@@ -15,22 +15,22 @@ from ppl_jax.algorithms.ensemble_dagger import (
     Bootstrap,
     add_human,
     clone_members,
-    doubt,
+    ensemble_variance,
     init_bootstrap,
 )
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, ensemble_layers, make_critic, make_ensemble
-from ppl_jax.types import DecisionPoint, Interaction, WorldSpec
+from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 RISK_DISCOUNT = 0.9999  # of the probability of success
 GOAL_SHARE = 0.1  # of a batch that are steps which solved the task, once there are any
 GOALS = 256  # such steps kept
-RECENT = 500  # steps of the novice whose doubt and safety set the thresholds
+RECENT = 500  # steps of the novice whose ensemble_variance and safety set the thresholds
 ENOUGH = 25  # of them, before which the initial thresholds hold
 UNSAFE, SAFE = 0.48, 0.495  # initial thresholds of safety: ask, and hand back
-SAMPLE = 256  # demonstrated states whose doubt sets the initial threshold of novelty
+SAMPLE = 256  # demonstrated states whose ensemble_variance sets the initial threshold of novelty
 
 
 @flax.struct.dataclass
@@ -68,7 +68,7 @@ class ThriftyState:
         learned: `ThriftyLearned`.
         human: Steps under the expert's control, with a bootstrap per member.
         steps, goals: `RiskStep` of everybody; of those that solved the task.
-        recent: (doubt, safety) of the novice's last steps.
+        recent: (ensemble_variance, safety) of the novice's last steps.
     """
 
     learned: ThriftyLearned
@@ -91,14 +91,14 @@ def risk_target(success: jax.Array, terminated: jax.Array, following: jax.Array)
     return jnp.where(success, 1.0, RISK_DISCOUNT * (1.0 - terminated) * following)
 
 
-def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
+def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """Thrifty-DAgger: two tests, each with a budget.
 
-        to the expert:  doubt(s) > delta_h  or  Q(s, a_n) < beta_h
+        to the expert:  ensemble_variance(s) > delta_h  or  Q(s, a_n) < beta_h
         back:           |a_n - a_h|^2 < delta_r  and  Q(s, a_n) > beta_r
 
-    doubt is the variance of the ensemble, Q the estimated probability of success (the smaller of
-    two). delta_h is the (1 - alpha) quantile of the doubt and beta_h the alpha quantile of Q over
+    ensemble_variance is the variance of the ensemble, Q the estimated probability of success (the smaller of
+    two). delta_h is the (1 - alpha) quantile of the ensemble_variance and beta_h the alpha quantile of Q over
     the novice's recent steps (alpha = `switch_rate`), beta_r the median of Q, delta_r the mean
     discrepancy on the demonstrations. Q learns from every step and from whether the task was
     solved, which no other method here gets to know.
@@ -140,14 +140,14 @@ def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         shown = state.human.buffer
         rows = jnp.arange(SAMPLE) % jnp.maximum(buffers.size(shown), 1)
         at_first = jnp.quantile(
-            doubt(ensemble, policies, shown.data[0][rows]), 1.0 - hparams.switch_rate
+            ensemble_variance(ensemble, policies, shown.data[0][rows]), 1.0 - hparams.switch_rate
         )
         few = held < ENOUGH
         novel = jnp.where(few, at_first, quantile(recent, doubts, 1.0 - hparams.switch_rate))
         unsafe = jnp.where(few, UNSAFE, quantile(recent, safeties, hparams.switch_rate))
         safe = jnp.where(few, SAFE, quantile(recent, safeties, 0.5))
         now = safety(state.learned.risk.params, point.observation, point.novice_action)
-        ask = (doubt(ensemble, policies, point.observation) > novel) | (now < unsafe)
+        ask = (ensemble_variance(ensemble, policies, point.observation) > novel) | (now < unsafe)
         apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
         hand_back = (apart < state.learned.discrepancy) & (now > safe)
         return jnp.where(point.takeover, ~hand_back, ask)
@@ -163,7 +163,7 @@ def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         )
         row = jax.tree.map(lambda leaf: leaf[None], item)
         seen = (
-            doubt(ensemble, state.learned.policies.params, step.observation)[None],
+            ensemble_variance(ensemble, state.learned.policies.params, step.observation)[None],
             safety(state.learned.risk.params, step.observation, step.novice_action)[None],
         )
         return dataclasses.replace(
@@ -205,7 +205,7 @@ def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
             grads,
             hparams.learning_rate,
             buffers.size(state.steps) > 0,
-            hparams.target_rate,
+            hparams.polyak_tau,
         )
         learned = dataclasses.replace(learned, policies=policies, risk=risk)
         return dataclasses.replace(state, learned=learned), metrics | {"loss_risk": loss}
@@ -225,5 +225,13 @@ def make_thrifty_dagger(spec: WorldSpec, config: TrainConfig) -> Algorithm:
         return ensemble_layers(state.learned.policies.average)
 
     return Algorithm(
-        "thrifty_dagger", init, act, decide, store, update, policy_layers, fit=fit, asks=False
+        "thrifty_dagger",
+        init,
+        act,
+        decide,
+        store,
+        update,
+        policy_layers,
+        fit=fit,
+        supports_human=False,
     )

@@ -1,0 +1,187 @@
+"""Operational-space control (robosuite's OSC_POSE, fixed impedance) and the arm's free motion."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from envs.manipulation.physics.analytic import unrolled_linalg
+from envs.manipulation.physics.analytic.arm import (
+    Frames,
+    Matrix,
+    Vector,
+    add,
+    combine,
+    cross,
+    dot,
+    frames,
+    jacobian,
+    mass_matrix,
+    scale,
+)
+from envs.manipulation.scenes.model import (
+    AIR_DENSITY,
+    AIR_VISCOSITY,
+    DAMPING,
+    FRICTION_LOSS,
+    TORQUE_LIMIT,
+    Tool,
+)
+
+Scalar = Any
+
+STIFFNESS = 150.0  # 1/s^2, of position and orientation
+DAMPING_RATE = 2.0 * STIFFNESS**0.5  # 1/s: critical
+POSITION_STEP, ROTATION_STEP = 0.05, 0.5  # m and rad, what an action of 1 asks for
+_SETTLING = 1e-3  # rad/s, within which friction in the joints builds up
+
+
+def rotation_from(vector: Vector) -> Matrix:
+    """Rotation by |vector| about vector (Rodrigues), finite at zero."""
+    square = dot(vector, vector)
+    angle = jnp.sqrt(square + 1e-20)
+    sine = jnp.sin(angle) / angle
+    fall = (1.0 - jnp.cos(angle)) / (angle * angle)
+    x, y, z = vector
+    return (
+        (1.0 - fall * (y * y + z * z), fall * x * y + sine * z, fall * x * z - sine * y),
+        (fall * x * y - sine * z, 1.0 - fall * (x * x + z * z), fall * y * z + sine * x),
+        (fall * x * z + sine * y, fall * y * z - sine * x, 1.0 - fall * (x * x + y * y)),
+    )
+
+
+def new_goal(
+    action: list[Scalar], position: Vector, rotation: Matrix, held: Matrix
+) -> tuple[Vector, Matrix]:
+    """Goal of a control step: where the grip site is now, moved and turned by the action.
+
+        x_goal = x + 0.05 a[:3],  R_goal = exp(0.5 a[3:]) R,  or the last R_goal where a[3:] = 0
+
+    Source: robosuite 1.4.1, `controllers/osc.py`, `set_goal`.
+    """
+    goal = add(position, scale(POSITION_STEP, tuple(action[:3])))
+    turn = rotation_from(scale(ROTATION_STEP, tuple(action[3:6])))
+    turned = any_nonzero(action[3:6])
+    columns = []
+    for now, before in zip(rotation, held, strict=True):
+        new = combine(turn, now)
+        columns.append(tuple(jnp.where(turned, a, b) for a, b in zip(new, before, strict=True)))
+    return goal, tuple(columns)
+
+
+def any_nonzero(values: list[Scalar]) -> Scalar:
+    """Whether any of them is not zero."""
+    found = values[0] != 0
+    for value in values[1:]:
+        found = found | (value != 0)
+    return found
+
+
+class Motion(NamedTuple):
+    """The arm at the start of a physics step.
+
+    Attributes:
+        at: Kinematics.
+        columns: Jacobian of the grip site, per joint (linear, angular).
+        twist: Velocity of the grip site, m/s and rad/s.
+        matrix: Mass matrix.
+        acceleration: Of the joints, without contact, rad/s^2.
+        speeds: Of the joints, rad/s.
+    """
+
+    at: Frames
+    columns: list[tuple[Vector, Vector]]
+    twist: tuple[Vector, Vector]
+    matrix: unrolled_linalg.Rows
+    acceleration: list[Scalar]
+    speeds: list[Scalar]
+
+
+def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple[Vector, Vector]:
+    """The product J rates."""
+    linear = angular = (0.0, 0.0, 0.0)
+    for (a, b), rate in zip(columns, rates, strict=True):
+        linear, angular = add(linear, scale(rate, a)), add(angular, scale(rate, b))
+    return linear, angular
+
+
+def joint_torque(columns: list[tuple[Vector, Vector]], force: Vector, torque: Vector):
+    """The product J' [force, torque]."""
+    return [dot(a, force) + dot(b, torque) for a, b in columns]
+
+
+def drag(tool: Tool, rotation: Matrix, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """Force and torque of the air on the tool (MuJoCo's inertia-box model).
+
+    The wiper's nominal inertia makes it a box of 1.4 m: at 1 rad/s the air brakes it by 0.2 N m.
+    """
+    side = tool.box
+    result = []
+    for vector, quadratic, viscous in (
+        (twist[0], 0.5 * AIR_DENSITY * side**2, 3 * jnp.pi * side * AIR_VISCOSITY),
+        (twist[1], AIR_DENSITY * side**5 / 32, jnp.pi * side**3 * AIR_VISCOSITY),
+    ):
+        local = tuple(dot(axis, vector) for axis in rotation)
+        local = tuple(-(quadratic * jnp.abs(v) + viscous) * v for v in local)
+        result.append(combine(rotation, local))
+    return result[0], result[1]
+
+
+def free_motion(
+    joints: list[Scalar],
+    speeds: list[Scalar],
+    goal: tuple[Vector, Matrix],
+    tool: Tool,
+    weight: list[Scalar],
+) -> Motion:
+    """Acceleration that the controller gives the arm where nothing touches it.
+
+        tau = clip(J' [L_p (k e_p - d v); L_o (k e_o - d w)] + bias, limits)
+        L_p = (J_p M^-1 J_p')^-1,  L_o = (J_o M^-1 J_o')^-1,  e_o = sum_i R_i x G_i / 2
+
+    Source: robosuite 1.4.1, `controllers/osc.py`, `run_controller`; the null-space term is zero
+    for six joints.
+
+    Args:
+        joints, speeds: rad, rad/s.
+        goal: Position (in the base's frame) and rotation of the grip site.
+        tool: In the hand.
+        weight: `bias_torque` at the start of the control step. It is added and compensated, so
+            that it matters only where a torque limit cuts in.
+    """
+    at = unrolled_linalg.materialize(frames(joints, tool))
+    columns = jacobian(at)
+    linear, angular = twist_of(columns, speeds)
+    matrix = unrolled_linalg.materialize(mass_matrix(at, tool))
+    factor = unrolled_linalg.materialize(unrolled_linalg.cholesky(matrix))
+    halves = unrolled_linalg.materialize(
+        [
+            unrolled_linalg.forward(factor, [column[part][axis] for column in columns])
+            for part in (0, 1)
+            for axis in range(3)
+        ]
+    )
+    error = add(goal[0], scale(-1.0, at.position))
+    twisted: Vector = (0.0, 0.0, 0.0)
+    for now, wanted in zip(at.rotation, goal[1], strict=True):
+        twisted = add(twisted, scale(0.5, cross(now, wanted)))
+    wanted_force = [STIFFNESS * e - DAMPING_RATE * v for e, v in zip(error, linear, strict=True)]
+    wanted_torque = [
+        STIFFNESS * e - DAMPING_RATE * v for e, v in zip(twisted, angular, strict=True)
+    ]
+    inverse = [[unrolled_linalg.inner(a, b) for b in halves] for a in halves[:3]]
+    force = unrolled_linalg.apply_inverse3([row[:3] for row in inverse], wanted_force)
+    inverse = [[unrolled_linalg.inner(a, b) for b in halves[3:]] for a in halves[3:]]
+    torque = unrolled_linalg.apply_inverse3(inverse, wanted_torque)
+    task = joint_torque(columns, tuple(force), tuple(torque))
+    air = joint_torque(columns, *drag(tool, at.rotation, (linear, angular)))
+    net = []
+    for index in range(6):
+        limit = TORQUE_LIMIT[index]
+        applied = jnp.clip(task[index] + weight[index], -limit, limit) - weight[index]
+        brake = DAMPING * speeds[index] + FRICTION_LOSS * jnp.tanh(speeds[index] / _SETTLING)
+        net.append(applied + air[index] - brake)
+    return Motion(
+        at, columns, (linear, angular), matrix, unrolled_linalg.solve(factor, net), speeds
+    )

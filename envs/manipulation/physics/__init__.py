@@ -1,0 +1,1 @@
+"""What advances an arm: one file or folder a back end."""

@@ -1,0 +1,1 @@
+"""The arms' physics written out in scalars: the fast path on a CPU."""

@@ -1,0 +1,1 @@
+"""What stands in a scene: links, tools, table, nut and peg."""

@@ -1,0 +1,1 @@
+"""The tasks: state, reward, success, observation, starts."""

@@ -1,0 +1,52 @@
+"""What both arm worlds share: a pool of starts, and where the grip site is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Environment
+from envs.manipulation.physics.analytic import unrolled_linalg
+from envs.manipulation.physics.analytic.arm import Frames, frames
+from envs.manipulation.scenes.model import TIMESTEP, Tool
+
+
+class ArmWorld(Environment):
+    """Base of the arm worlds: parameters are pools of starts with a field `number`, [S].
+
+    Attributes:
+        tool: In the hand.
+        base: [3] of the arm in the world, m.
+        default_params, held_out_params: Starts to train on and to evaluate on.
+    """
+
+    tool: Tool
+    base: np.ndarray
+    sequential_on_cpu = True
+
+    def __init__(self, default_params: Any, held_out_params: Any):
+        self.default_params = default_params
+        self.held_out_params = held_out_params
+
+    def scenario_numbers(self, params: Any) -> jax.Array:
+        """Numbers of the pool's scenarios, [S]."""
+        return params.number
+
+    def scenario_count(self, params: Any) -> int:
+        """Number of scenarios in the pool."""
+        return params.number.shape[0]
+
+    def grip_position(self, state: Any) -> jax.Array:
+        """Where the grip site is, [3] m in the world."""
+        return jnp.stack(lagged_frames(state, self.tool).position) + self.base
+
+
+def lagged_frames(state: Any, tool: Tool) -> Frames:
+    """Kinematics one physics step ago: what robosuite observes and rewards.
+
+    MuJoCo's poses are those of the start of its last step; q - h dq is exactly that state.
+    """
+    return unrolled_linalg.materialize(frames(list(state.joints - TIMESTEP * state.speeds), tool))

@@ -1,0 +1,368 @@
+"""Nut assembly: a UR5e lifts a ring by its handle and puts it on a peg (NutAssemblyRound)."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.manipulation.control import gripper, operational_space
+from envs.manipulation.control.quaternion import hand_quaternion, multiply
+from envs.manipulation.physics.analytic import unrolled_linalg
+from envs.manipulation.physics.analytic.arm import bias_torque, frames
+from envs.manipulation.physics.analytic.grasp_contact import Ring, hold
+from envs.manipulation.scenes.model import (
+    GRIPPER,
+    HANDLE,
+    INITIAL_JOINTS,
+    INITIAL_NOISE,
+    NUT_BASE,
+    PEG,
+    SUBSTEPS,
+    TIMESTEP,
+)
+from envs.manipulation.tasks.base import ArmWorld, lagged_frames
+from ppl_jax.types import EnvSpec, Expert, Outcome
+
+OBSERVATION_SIZE, ACTION_SIZE = 51, 7
+HORIZON = 1000  # control steps of 0.05 s
+TRAINING_SCENARIOS = range(1000)
+HELD_OUT_SCENARIOS = range(1000, 1050)
+
+# reward and success (robosuite 1.4.1, environments/manipulation/nut_assembly.py)
+REACH, GRASP, LIFT, HOVER = 0.1, 0.35, 0.5, 0.7
+LIFT_HEIGHT = 0.995  # m, of the table's centre plus 0.2
+DISTRACTED = 43  # steps in which the parked square nut, still falling, counts as lifted
+PEG_RANGE, PEG_HEIGHT = 0.03, 0.87  # m, of the ring's centre about the peg; below which it is on
+PRESENCE = 0.6  # largest 1 - tanh(10 distance) of gripper to ring for success
+PLACE_X, PLACE_Y, PLACE_Z = (-0.115, -0.11), (-0.225, -0.11), 0.89  # m, where the ring starts
+FALLEN = 0.75  # m, below which the ring has left the table for good
+
+_BASE = np.array(NUT_BASE, np.float32)
+
+
+@flax.struct.dataclass
+class NutState:
+    """Everything that the next step depends on.
+
+    Attributes:
+        joints, speeds: [6] rad, rad/s.
+        acceleration: [14] of the last physics step, where the contact solver starts.
+        goal_rotation: [3, 3] rows are the axes of the controller's orientation goal.
+        fingers, finger_speeds: [6] gripper joints (left knuckle, inner finger, inner knuckle;
+            right), rad, rad/s.
+        command: Gripper command, -1 open to 1 closed.
+        touching: Both pads touch the ring.
+        position, quaternion: [3] m in the world, [4] w x y z of the ring.
+        velocity, spin: [3] m/s and rad/s of the ring, world axes.
+        scenario, time: Number and steps so far.
+    """
+
+    joints: jax.Array
+    speeds: jax.Array
+    acceleration: jax.Array
+    goal_rotation: jax.Array
+    fingers: jax.Array
+    finger_speeds: jax.Array
+    command: jax.Array
+    touching: jax.Array
+    position: jax.Array
+    quaternion: jax.Array
+    velocity: jax.Array
+    spin: jax.Array
+    scenario: jax.Array
+    time: jax.Array
+
+
+@flax.struct.dataclass
+class NutParams:
+    """Starts of the pool, and what a study may change.
+
+    Attributes:
+        joints: [S, 6] rad. place: [S, 3] x, y (m, world) and yaw of the ring. number: [S].
+        reward_scale: Factor on robosuite's reward.
+    """
+
+    joints: jax.Array
+    place: jax.Array
+    number: jax.Array
+    reward_scale: jax.Array | float = 1.0
+
+
+def rotation_matrix(quaternion: jax.Array) -> jax.Array:
+    """[3, 3] of w x y z; columns are the axes."""
+    w, x, y, z = quaternion
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def turned(quaternion: jax.Array, spin: jax.Array, time: float) -> jax.Array:
+    """Quaternion after turning by `spin` (world axes) for `time`."""
+    angle = jnp.sqrt(jnp.sum(spin * spin) + 1e-20)
+    half = 0.5 * time * angle
+    axis = jnp.sin(half) / angle * spin
+    new = jnp.stack(multiply((jnp.cos(half), *axis), tuple(quaternion)))
+    return new / jnp.sqrt(jnp.sum(new * new))
+
+
+def lagged_ring(state: NutState) -> tuple[jax.Array, jax.Array]:
+    """Position and quaternion of the ring one physics step ago."""
+    position = state.position - TIMESTEP * state.velocity
+    return position, turned(state.quaternion, state.spin, -TIMESTEP)
+
+
+def handle_of(position: jax.Array, quaternion: jax.Array) -> jax.Array:
+    """Centre of the handle, [3]."""
+    return position + rotation_matrix(quaternion) @ jnp.array(HANDLE)
+
+
+def advance(state: NutState, action: jax.Array) -> NutState:
+    """One control step of the physics: 25 steps of 2 ms; time and contact flag included.
+
+    On a CPU a batch goes one world after another: the contact solver is as fast with one as with
+    many, and then stops in each world as soon as it has converged.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.custom_batching.sequential_vmap(_advance)(state, action)
+    return _advance(state, action)
+
+
+def _advance(state: NutState, action: jax.Array) -> NutState:
+    at = unrolled_linalg.materialize(frames(list(state.joints), GRIPPER))
+    action = jnp.clip(action, -1.0, 1.0)
+    held = tuple(tuple(row) for row in state.goal_rotation)
+    goal = unrolled_linalg.materialize(
+        operational_space.new_goal(list(action[:6]), at.position, at.rotation, held)
+    )
+    weight = unrolled_linalg.materialize(bias_torque(at, GRIPPER, list(state.speeds)))
+    grip = gripper.RAMP * jnp.sign(action[6])
+
+    def step(s: NutState, _: None) -> tuple[NutState, None]:
+        command = jnp.clip(s.command + grip, -1.0, 1.0)
+        motion = operational_space.free_motion(
+            list(s.joints), list(s.speeds), goal, GRIPPER, weight
+        )
+        ring = Ring(s.position - _BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
+        knuckles, inner = s.fingers[::3], s.fingers[1::3]
+        result = hold(
+            motion,
+            ring,
+            knuckles,
+            s.finger_speeds[::3],
+            inner,
+            gripper.command_to_control(command),
+            s.acceleration,
+        )
+        a = result.acceleration
+        speeds = s.speeds + TIMESTEP * a[:6]
+        knuckle_speeds = s.finger_speeds[::3] + TIMESTEP * a[6:8]
+        knuckles = knuckles + TIMESTEP * knuckle_speeds
+        finger_rest, knuckle_rest = gripper.following_rest(knuckles, result.squeeze)
+        inner_speeds = (finger_rest - inner) / gripper.FOLLOW
+        outer = s.fingers[2::3]
+        outer_speeds = (knuckle_rest - outer) / gripper.FOLLOW
+        velocity, spin = s.velocity + TIMESTEP * a[8:11], s.spin + TIMESTEP * a[11:]
+        return s.replace(
+            joints=s.joints + TIMESTEP * speeds,
+            speeds=speeds,
+            acceleration=a,
+            fingers=jnp.stack(
+                [knuckles, inner + TIMESTEP * inner_speeds, outer + TIMESTEP * outer_speeds], -1
+            ).reshape(6),
+            finger_speeds=jnp.stack([knuckle_speeds, inner_speeds, outer_speeds], -1).reshape(6),
+            command=command,
+            touching=jnp.all(result.touching),
+            position=s.position + TIMESTEP * velocity,
+            quaternion=turned(s.quaternion, spin, TIMESTEP),
+            velocity=velocity,
+            spin=spin,
+        ), None
+
+    rows = unrolled_linalg.array(goal[1])
+    start = state.replace(goal_rotation=rows, time=state.time + 1)
+    return jax.lax.scan(step, start, None, length=SUBSTEPS)[0]
+
+
+def stages(
+    eef: jax.Array, position: jax.Array, handle: jax.Array, touching: jax.Array, time: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Robosuite's staged reward (reach, grasp, lift, hover), [4], and whether the ring is on.
+
+        reach 0.1 (1 - tanh 10 d), grasp 0.35, lift 0.35 + 0.15 (1 - tanh 15 max(0.995 - z, 0)),
+        hover lift + 0.2 (1 - tanh 10 |xy - peg|)
+
+    Args:
+        eef, position, handle: [3] grip site, ring's centre and its handle, m.
+        touching: Both pads touch the ring.
+        time: Steps since the start, this one included.
+    """
+    reach = REACH * (1 - jnp.tanh(10 * jnp.linalg.norm(eef - handle)))
+    missing = jnp.where(time <= DISTRACTED, 0.0, jnp.maximum(LIFT_HEIGHT - position[2], 0.0))
+    lift = jnp.where(touching, GRASP + (LIFT - GRASP) * (1 - jnp.tanh(15 * missing)), 0.0)
+    away = position[:2] - jnp.array(PEG[:2])
+    hover = lift + (HOVER - LIFT) * (1 - jnp.tanh(10 * jnp.linalg.norm(away)))
+    on = jnp.all(jnp.abs(away) < PEG_RANGE) & (position[2] < PEG_HEIGHT)
+    return jnp.stack([reach, jnp.where(touching, GRASP, 0.0), lift, hover]), on
+
+
+# what a network sees is (observation - MEAN) / SCALE
+MEAN = np.concatenate(
+    [[*PEG[:2], 0.9], [0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.5, 0.5, 0.0, 0.0],
+     np.cos(INITIAL_JOINTS), np.sin(INITIAL_JOINTS), np.zeros(6), [0.0, -0.13, 0.95],
+     [-1.0, 0.03, 0.0, 0.0], [0.2, -0.27, 0.0] * 2, np.zeros(6)]
+).astype(np.float32)  # fmt: skip
+# what has to be done next shows in millimetres between gripper and handle and between ring and peg;
+# joints and their speeds say it again in a nonlinear way and are kept quiet (chosen by cloning on
+# scenarios 2000-2049: 0.48 with the ring seen in units of 15 and 5 cm, 0.94 in units of 2 cm)
+SCALE = np.concatenate(
+    [[0.02, 0.02, 0.02], np.full(4, 0.5), [0.02, 0.02, 0.02], np.full(4, 0.3),
+     np.full(12, 3.0), np.full(6, 3.0), [0.15, 0.1, 0.02], np.full(4, 0.3),
+     np.full(6, 0.1), np.full(6, 10.0)]
+).astype(np.float32)  # fmt: skip
+
+
+class NutAssembly(ArmWorld):
+    """Nut assembly as pure functions. Build one with `make_nut_assembly`."""
+
+    name = "nut_assembly"
+    spec = EnvSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
+    max_episode_steps = HORIZON
+    tool = GRIPPER
+    base = _BASE
+
+    @property
+    def scripted_expert(self) -> Expert:
+        """The world's default expert."""
+        from envs.manipulation.experts.nut import scripted_expert
+
+        return scripted_expert
+
+    def reset_to(self, index: jax.Array, key: jax.Array, params: NutParams) -> NutState:
+        """The start of scenario `index` of the pool."""
+        del key  # a scenario is deterministic
+        joints, place = params.joints[index], params.place[index]
+        at = frames(list(joints), GRIPPER)
+        zero = jnp.zeros(())
+        return NutState(
+            joints=joints,
+            speeds=jnp.zeros(6),
+            acceleration=jnp.zeros(14),
+            goal_rotation=unrolled_linalg.array(at.rotation),
+            fingers=jnp.asarray(gripper.INITIAL, jnp.float32),
+            finger_speeds=jnp.zeros(6),
+            command=zero,
+            touching=jnp.zeros((), bool),
+            position=jnp.append(place[:2], PLACE_Z),
+            quaternion=jnp.stack([jnp.cos(place[2] / 2), zero, zero, jnp.sin(place[2] / 2)]),
+            velocity=jnp.zeros(3),
+            spin=jnp.zeros(3),
+            scenario=jnp.asarray(index, jnp.int32),
+            time=jnp.zeros((), jnp.int32),
+        )
+
+    def transition(
+        self, key: jax.Array, state: NutState, action: jax.Array, params: NutParams
+    ) -> tuple[NutState, Outcome]:
+        """One control step of 0.05 s, without reset."""
+        del key  # the world is deterministic
+        return self.finish(state, advance(state, action), params)
+
+    def finish(
+        self, state: NutState, moved: NutState, params: NutParams
+    ) -> tuple[NutState, Outcome]:
+        """What a control step means, given its physics (see `advance`)."""
+        values = [leaf for leaf in jax.tree.leaves(moved) if leaf.dtype == jnp.float32]
+        physics_diverged = ~jnp.all(
+            jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in values]))
+        )
+        new = jax.tree.map(lambda a, b: jnp.where(physics_diverged, b, a), moved, state)
+        new = new.replace(time=state.time + 1)
+        at = lagged_frames(new, GRIPPER)
+        eef = jnp.stack(at.position) + _BASE
+        position, quaternion = lagged_ring(new)
+        staged, on = stages(eef, position, handle_of(position, quaternion), new.touching, new.time)
+        near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
+        success = on & (near < PRESENCE) & ~physics_diverged
+        fallen = position[2] < FALLEN
+        # as in robosuite, a ring on the peg no longer counts in the stages
+        reward = jnp.where(success, 1.0, jnp.max(staged))
+        lost = fallen | physics_diverged
+        return new, Outcome(
+            reward=jnp.where(physics_diverged, 0.0, params.reward_scale * reward),
+            terminated=success | lost,
+            truncated=new.time >= HORIZON,
+            cost=fallen.astype(jnp.float32),
+            success=success,
+            unsafe=fallen,
+            progress=jnp.where(success, 1.0, jnp.max(staged)),
+            speed=jnp.linalg.norm(
+                jnp.stack(
+                    operational_space.twist_of(operational_space.jacobian(at), list(new.speeds))[0]
+                )
+            ),
+            physics_diverged=physics_diverged,
+        )
+
+    def observe(self, state: NutState, params: NutParams) -> jax.Array:
+        """The 51 values, in robosuite 1.4.1's order.
+
+        0-2 ring, 3-6 its quaternion (x y z w), 7-9 and 10-13 its position and quaternion in the
+        hand's frame, 14-19 cos q, 20-25 sin q, 26-31 dq, 32-34 grip site, 35-38 hand (x y z w),
+        39-44 gripper joints, 45-50 their speeds.
+        """
+        lagged = list(state.joints - TIMESTEP * state.speeds)
+        at = frames(lagged, GRIPPER)
+        eef = jnp.stack(at.position) + _BASE
+        hand = hand_quaternion(lagged)
+        position, quaternion = lagged_ring(state)
+        back = (hand[3], -hand[0], -hand[1], -hand[2])
+        w, x, y, z = multiply(back, tuple(quaternion))
+        relative = jnp.stack([x, y, z, w]) * jnp.where(w < 0, -1.0, 1.0)
+        axes = unrolled_linalg.array(at.links[6][1])
+        return jnp.concatenate(
+            [
+                position,
+                jnp.roll(quaternion, -1),
+                axes @ (position - eef),
+                relative,
+                jnp.cos(state.joints),
+                jnp.sin(state.joints),
+                state.speeds,
+                eef,
+                hand,
+                state.fingers,
+                state.finger_speeds,
+            ]
+        )
+
+
+def make_params(numbers: range) -> NutParams:
+    """Starts of the scenarios with these numbers."""
+
+    def start(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+        key_joints, key_place = jax.random.split(jax.random.key(number))
+        low = jnp.array([PLACE_X[0], PLACE_Y[0], 0.0])
+        high = jnp.array([PLACE_X[1], PLACE_Y[1], 2 * jnp.pi])
+        noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
+        return INITIAL_JOINTS + noise, jax.random.uniform(key_place, (3,), minval=low, maxval=high)
+
+    number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
+    joints, place = jax.jit(jax.vmap(start))(number)
+    return NutParams(joints.astype(jnp.float32), place, number, jnp.float32(1.0))
+
+
+def make_nut_assembly(
+    training: range = TRAINING_SCENARIOS, held_out: range = HELD_OUT_SCENARIOS
+) -> NutAssembly:
+    """Build the nut assembly world.
+
+    Args:
+        training, held_out: Numbers of the scenarios to train and to evaluate on.
+    """
+    return NutAssembly(make_params(training), make_params(held_out))

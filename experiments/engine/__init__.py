@@ -1,0 +1,1 @@
+"""One run: settings, host loop, worker, files."""

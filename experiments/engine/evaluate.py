@@ -1,0 +1,207 @@
+"""Evaluation of a policy: every held-out scenario once, and the numbers that sum it up."""
+
+from __future__ import annotations
+
+import csv
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs import make, pretrained
+from experiments.engine.policy_file import load_meta, load_policy
+from experiments.engine.run_folder import EVALUATION, POLICY, RunFolder
+from experiments.engine.runtime import UserError
+from ppl_jax import experts
+from ppl_jax.evaluation import Episodes, make_evaluate
+from ppl_jax.experts import SavedPolicy, neural_expert
+from ppl_jax.types import Env, EnvSpec, Expert
+
+
+class EvaluationRow(NamedTuple):
+    """One row of evaluation.csv."""
+
+    step: int
+    scenario: int
+    success: int
+    episodic_return: float
+    progress: float
+    episodic_cost: float
+    length: int
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+def _episodes(env: Env, arrays: Any, activation: str, output: str, params: Any, key: jax.Array):
+    weights, mean, scale = arrays
+    policy = SavedPolicy(weights, activation, output, mean, scale)
+
+    def act(key: jax.Array, state: Any, observation: jax.Array, params: Any) -> jax.Array:
+        return experts.act(policy, observation)
+
+    return make_evaluate(env, act)(params, key)
+
+
+def arrays_of(policy: SavedPolicy) -> SavedPolicy:
+    """A policy's numbers as float32 arrays of JAX."""
+    weights, mean, scale = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float32),
+        (list(policy.weights), policy.obs_mean, policy.obs_scale),
+    )
+    return policy._replace(weights=weights, obs_mean=mean, obs_scale=scale)
+
+
+def evaluate_policy(
+    env: Env, policy: SavedPolicy, step: int, on: str = "held_out"
+) -> list[EvaluationRow]:
+    """Play every held-out (or training) scenario of `env` once, without the expert."""
+    policy = arrays_of(policy)
+    arrays = (policy.weights, policy.obs_mean, policy.obs_scale)
+    params = env.held_out_params if on == "held_out" else env.default_params
+    episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
+    return rows_of(episodes, env.scenario_numbers(params), step)
+
+
+def rows_of(episodes: Episodes, numbers: Any, step: int) -> list[EvaluationRow]:
+    """Episodes as rows."""
+    columns = [np.asarray(column) for column in episodes]
+    return [
+        EvaluationRow(
+            step,
+            int(numbers[i]),
+            int(columns[0][i]),
+            round(float(columns[1][i]), 4),
+            round(float(columns[3][i]), 5),
+            round(float(columns[2][i]), 4),
+            int(columns[4][i]),
+        )
+        for i in range(len(columns[0]))
+    ]
+
+
+def summarise_episodes(rows: list[EvaluationRow]) -> dict[str, float]:
+    """Means over episodes, under the names of summary.json."""
+    return {
+        "success_rate": float(np.mean([row.success for row in rows])),
+        "episodic_return": float(np.mean([row.episodic_return for row in rows])),
+        "route_completion": float(np.mean([row.progress for row in rows])),
+        "episodic_cost": float(np.mean([row.episodic_cost for row in rows])),
+        "episode_length": float(np.mean([row.length for row in rows])),
+        "episodes": len(rows),
+    }
+
+
+def read_evaluation(run: Path) -> list[EvaluationRow]:
+    """Rows of a run folder's evaluation.csv."""
+    with open(run / EVALUATION, newline="") as file:
+        return [
+            EvaluationRow(
+                int(row["step"]),
+                int(row["scenario"]),
+                int(row["success"]),
+                float(row["episodic_return"]),
+                float(row["progress"]),
+                float(row["episodic_cost"]),
+                int(row["length"]),
+            )
+            for row in csv.DictReader(file)
+        ]
+
+
+def policy_path(run: Path) -> Path:
+    """The policy file of a run folder, or the file itself.
+
+    Raises:
+        UserError: If there is none.
+    """
+    if run.is_file():
+        return run
+    path = run / POLICY
+    if not path.is_file():
+        raise UserError(f"{str(run)!r} is neither a run folder with a policy nor a policy file")
+    return path
+
+
+def run_options(run: Path) -> tuple[str, dict[str, Any]]:
+    """The world of a run folder (or of a policy file's meta) and how it was built."""
+    if run.is_file():
+        try:
+            meta = load_meta(run)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        if not isinstance(meta, dict) or "env" not in meta:
+            raise UserError(f"policy file {str(run)!r} cannot be read: its meta names no env")
+        return meta["env"], {}
+    try:
+        config = RunFolder(run).config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    names = ("scenarios", "held_out_scenarios")
+    return config["env"], {name: config[name] for name in names if config[name] is not None}
+
+
+def run_spec(run: Path) -> EnvSpec:
+    """Sizes of a run's world."""
+    env, _ = run_options(run)
+    return make_world(env, {}).spec
+
+
+def make_world(name: str, options: dict[str, Any]) -> Env:
+    """Build a world; a mistake becomes a `UserError`."""
+    try:
+        return make(name, **options)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def named_expert(name: str, env: Env) -> Expert:
+    """The expert "scripted", the shipped one, "neural", or that of a policy file or run folder.
+
+    Raises:
+        UserError: If there is none, or the file cannot be used.
+    """
+    if name == "scripted":
+        expert = getattr(env, "scripted_expert", None)
+        if expert is None:
+            raise UserError(f"expert: {env.name} has no scripted expert, give a policy file")
+        return expert
+    return neural_expert(named_policy(name, env))
+
+
+def named_policy(name: str, env: Env) -> SavedPolicy:
+    """The shipped expert's policy, "neural", or that of a policy file or run folder.
+
+    Raises:
+        UserError: If there is none, or the file cannot be used.
+    """
+    if name != "neural":
+        path = Path(name)
+        return read_policy(policy_path(path) if path.is_dir() else path, env.spec)
+    try:
+        return read_policy(pretrained.policy_path(env.name), env.spec)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def read_policy(path: str | Path, spec: EnvSpec) -> SavedPolicy:
+    """Load a policy file for a world; a mistake becomes a `UserError`."""
+    try:
+        return load_policy(path, spec.observation_size, spec.action_size)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
+    """Play a run's held-out scenarios, or those of a folder of recordings, once.
+
+    Raises:
+        UserError: If run, policy or folder cannot be used.
+    """
+    source = policy_path(run)
+    name, options = run_options(run)
+    if scenarios is not None:
+        options = {"held_out_scenarios": scenarios}
+    env = make_world(name, options)
+    return evaluate_policy(env, read_policy(source, env.spec), 0)

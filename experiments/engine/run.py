@@ -1,0 +1,429 @@
+"""One training run: the host loop around the scanned chunks, and its run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs import known, unknown
+from experiments.engine.evaluate import (
+    arrays_of,
+    evaluate_policy,
+    make_world,
+    named_expert,
+    read_evaluation,
+    read_policy,
+    summarise_episodes,
+)
+from experiments.engine.policy_file import save_policy
+from experiments.engine.progress import Progress
+from experiments.engine.recorded import recorded_functions, recording_of
+from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
+from experiments.engine.runtime import UserError, device, revision, versions
+from ppl_jax import algorithms, checkpoint, experts
+from ppl_jax.config import HParams, TrainConfig, validate
+from ppl_jax.experts import SavedPolicy
+from ppl_jax.interaction import Learner
+from ppl_jax.losses import NEEDS_REFERENCE
+from ppl_jax.networks import Layers
+from ppl_jax.training import Phase, TrainFunctions, make_train, phases
+from ppl_jax.types import Env, Expert
+
+EVALUATE_EVERY = 1000  # steps
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """Everything that defines a run; config.json holds it.
+
+    Attributes:
+        env, algorithm, seed: What is trained.
+        config, hparams: Static and traced settings.
+        expert: "scripted", "neural" (the shipped one), a policy file, "person" (see
+            `experiments.ui`) or "recorded PATH" of such a session.
+        reference_policy: Policy file of the objectives that have a reference.
+        scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
+        evaluate_on: "held_out" or (to choose settings by) "training".
+        evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
+    """
+
+    env: str
+    algorithm: str
+    seed: int
+    config: TrainConfig
+    hparams: HParams
+    expert: str = "scripted"
+    reference_policy: str | None = None
+    scenarios: str | None = None
+    held_out_scenarios: str | None = None
+    evaluate_every: int = EVALUATE_EVERY
+    evaluate_on: str = "held_out"
+
+    def as_json(self) -> dict[str, Any]:
+        """For config.json."""
+        return {
+            "env": self.env,
+            "algorithm": self.algorithm,
+            "seed": self.seed,
+            "expert": self.expert,
+            "reference_policy": self.reference_policy,
+            "scenarios": self.scenarios,
+            "held_out_scenarios": self.held_out_scenarios,
+            "evaluate_every": self.evaluate_every,
+            "evaluate_on": self.evaluate_on,
+            "config": dataclasses.asdict(self.config),
+            "hparams": {k: float(v) for k, v in dataclasses.asdict(self.hparams).items()},
+        }
+
+    @staticmethod
+    def from_json(content: dict[str, Any]) -> RunSettings:
+        """The inverse of `as_json`; ignores what else config.json holds."""
+        config = dict(content["config"])
+        config["hidden"] = tuple(config["hidden"])
+        return RunSettings(
+            env=content["env"],
+            algorithm=content["algorithm"],
+            seed=content["seed"],
+            config=TrainConfig(**config),
+            hparams=HParams(**content["hparams"]),
+            expert=content["expert"],
+            reference_policy=content["reference_policy"],
+            scenarios=content["scenarios"],
+            held_out_scenarios=content["held_out_scenarios"],
+            evaluate_every=content["evaluate_every"],
+            evaluate_on=content["evaluate_on"],
+        )
+
+
+def check(settings: RunSettings) -> None:
+    """Refuse what cannot work, before anything is built.
+
+    Raises:
+        UserError: One line naming field, value and what is allowed.
+    """
+    if not known(settings.env):
+        raise UserError(unknown(settings.env))
+    if settings.seed < 0:
+        raise UserError(f"seed must not be negative, got {settings.seed}")
+    interval = settings.config.decision_interval
+    try:
+        algorithms.method(settings.algorithm)
+        validate(settings.config, settings.hparams)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    if settings.evaluate_every < 1 or settings.evaluate_every % interval:
+        raise UserError(
+            f"evaluate_every must be a positive multiple of decision_interval ({interval}), got "
+            f"{settings.evaluate_every}"
+        )
+    needs = settings.config.objective in NEEDS_REFERENCE
+    if needs and settings.reference_policy is None:
+        raise UserError(
+            f"objective {settings.config.objective!r} needs a reference policy: give "
+            "--reference-policy FILE, a policy trained by --algorithm bc, for one"
+        )
+    if settings.reference_policy is not None and (settings.algorithm != "ppl" or not needs):
+        raise UserError(
+            f"reference_policy is for ppl with objective {' or '.join(NEEDS_REFERENCE)}, got "
+            f"{settings.algorithm} with {settings.config.objective}"
+        )
+
+
+def make_env_and_expert(settings: RunSettings) -> tuple[Env, Expert]:
+    """The world and the expert of a run.
+
+    Raises:
+        UserError: If a scenario folder or the expert's file cannot be used.
+    """
+    env = build_world(settings)
+    return env, named_expert(settings.expert, env)
+
+
+def build_world(settings: RunSettings) -> Env:
+    """The world of a run.
+
+    Raises:
+        UserError: If a scenario folder cannot be used.
+    """
+    options = {
+        name: value
+        for name in ("scenarios", "held_out_scenarios")
+        if (value := getattr(settings, name)) is not None
+    }
+    return make_world(settings.env, options)
+
+
+def algorithm_factory(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
+    """The method of a run, with its reference policy where it has one.
+
+    Raises:
+        UserError: If the reference policy's file cannot be used.
+    """
+    make = algorithms.method(settings.algorithm).make
+    if settings.reference_policy is None:
+        return make
+    policy = arrays_of(read_policy(settings.reference_policy, env.spec))
+    return functools.partial(make, reference=functools.partial(experts.act, policy))
+
+
+def saved_policy(env: Env, layers: Layers) -> SavedPolicy:
+    """A trained policy as plain arrays on the world's raw observation."""
+    weights = [(np.asarray(w), np.asarray(b)) for w, b in layers]
+    return SavedPolicy(
+        weights, "relu", "tanh", env.spec.observation_mean, env.spec.observation_scale
+    )
+
+
+def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, Any]:
+    """Train, evaluating and saving on the way; returns the summary.
+
+    Args:
+        settings: Of the run.
+        out: Run folder.
+        resume: Go on from the folder's last checkpoint.
+
+    Raises:
+        UserError: If settings or folder cannot be used.
+    """
+    check(settings)
+    folder = RunFolder(out)
+    began = time.perf_counter()
+    try:
+        env, functions = _functions(settings)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    every = functions.algorithm.update_every
+    if settings.evaluate_every % every:
+        raise UserError(
+            f"evaluate_every must be a multiple of rollout_steps ({every}) for "
+            f"{settings.algorithm}, got {settings.evaluate_every}"
+        )
+    open_folder(folder, settings.as_json(), resume)
+    learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
+    plan = _plan(settings.config, settings.evaluate_every)
+    done = 0
+    if resume:
+        done, learner = restore_learner(folder, learner)
+        evaluated = [chunk.step for chunk in plan if chunk.evaluate and chunk.end <= done]
+        folder.rewind(done, max(evaluated, default=-1))
+        if done >= plan[-1].end:
+            print(f"{out} is complete already ({done} steps)", file=sys.stderr)
+            return folder.read_json(SUMMARY)
+    runner = _Runner(settings, folder, env, functions)
+    with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
+        waiting = [chunk for chunk in plan if chunk.end > done]
+        runner.compile(learner, waiting[-1])
+        progress.start()
+        for chunk in waiting:
+            learner, note = runner.run(learner, chunk)
+            progress.update(chunk.end, note)
+    return runner.finish(learner, time.perf_counter() - began)
+
+
+def _functions(settings: RunSettings) -> tuple[Env, TrainFunctions]:
+    recording = recording_of(settings.expert)
+    if recording is None:
+        env, expert = make_env_and_expert(settings)
+        return env, make_train(env, expert, algorithm_factory(settings, env), settings.config)
+    env = build_world(settings)
+    return env, recorded_functions(
+        env, algorithm_factory(settings, env), settings.config, recording
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Chunk:
+    """A piece of a run between two returns to the host.
+
+    Attributes:
+        phase: Of the loop.
+        length: Steps (updates in phase "fit").
+        end: Steps and offline updates of the run by then: what progress and checkpoints count.
+        step: Environment steps of the run by then.
+        evaluate: Whether the policy is evaluated then.
+    """
+
+    phase: Phase
+    length: int
+    end: int
+    step: int
+    evaluate: bool
+
+
+def _plan(config: TrainConfig, evaluate_every: int) -> list[_Chunk]:
+    """The chunks of a run; those of a phase are alike, its last may be shorter."""
+    plan: list[_Chunk] = []
+    end = step = 0
+    for phase, length in phases(config):
+        interact = phase == "interact"
+        size = evaluate_every if interact else _part(length, config.decision_interval)
+        left = length
+        while left:
+            piece = min(size, left)
+            left, end = left - piece, end + piece
+            step += 0 if phase == "fit" else piece
+            # what demonstrations alone teach is seen once, when they are learnt
+            plan.append(_Chunk(phase, piece, end, step, interact or (phase == "fit" and not left)))
+    if not plan[-1].evaluate:  # demonstrations that nothing is learnt from
+        plan[-1] = dataclasses.replace(plan[-1], evaluate=True)
+    return plan
+
+
+def _part(length: int, interval: int) -> int:
+    """A tenth of a long phase, in whole blocks."""
+    blocks = length // interval
+    parts = max(n for n in range(1, 11) if blocks % n == 0) if length >= 5000 else 1
+    return length // parts
+
+
+def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> None:
+    """Make a run folder, or check that the one to go on with was made with the same settings.
+
+    Args:
+        folder: Of the run.
+        content: Of config.json; versions, device and revision are added.
+        resume: Go on with the folder.
+
+    Raises:
+        UserError: If it cannot be made, or differs.
+    """
+    if resume:
+        try:
+            before = folder.config()
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        for name, value in content.items():
+            if before.get(name) != json.loads(json.dumps(value)):
+                raise UserError(
+                    f"cannot resume {str(folder.path)!r}: its {name} is {before.get(name)!r}, "
+                    f"asked for {value!r}"
+                )
+        return
+    try:
+        folder.create(
+            content
+            | {
+                "versions": versions(),
+                "device": device(),
+                "revision": revision(),
+            }
+        )
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
+    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none."""
+
+    def warn(line: str) -> None:
+        print(f"warning: {line}", file=sys.stderr)
+
+    found = checkpoint.restore(folder.checkpoints, learner, warn)
+    if found is None:
+        return 0, learner  # killed before its first checkpoint: from the start
+    return found
+
+
+class _Runner:
+    """Compiled functions of a run and what happens between its chunks."""
+
+    def __init__(
+        self, settings: RunSettings, folder: RunFolder, env: Env, functions: TrainFunctions
+    ):
+        self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
+        self.compile_s = self.train_s = 0.0
+        self.trained_steps = 0
+        self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
+
+    def _program(self, learner: Learner, chunk: _Chunk) -> Callable[[Learner], Any]:
+        kind = (chunk.phase, chunk.length)
+        if kind not in self.programs:
+            blocks = chunk.length // self.settings.config.decision_interval
+
+            def run(learner: Learner) -> Any:
+                return self.functions.run_chunk(learner, blocks, chunk.phase)
+
+            began = time.perf_counter()
+            jitted = jax.jit(run, donate_argnums=0)
+            self.programs[kind] = jitted.lower(learner).compile()
+            self.compile_s += time.perf_counter() - began
+        return self.programs[kind]
+
+    def compile(self, learner: Learner, chunk: _Chunk) -> None:
+        """Compile a chunk's program ahead of time."""
+        self._program(learner, chunk)
+
+    def run(self, learner: Learner, chunk: _Chunk) -> tuple[Learner, str]:
+        """Train to the end of a chunk, evaluate, log, save; returns learner and a note."""
+        program = self._program(learner, chunk)
+        began = time.perf_counter()
+        learner, metrics = jax.block_until_ready(program(learner))
+        seconds = time.perf_counter() - began
+        if chunk.phase == "interact":
+            self.train_s += seconds
+            self.trained_steps += chunk.length
+        layers = self.functions.algorithm.policy(learner.algorithm)
+        human = int(learner.counters.human_data)
+        row = {"step": chunk.step, "done": chunk.end, "phase": chunk.phase}
+        row |= {name: float(value) for name, value in metrics.items()}
+        note = f"human data {human}"
+        if chunk.evaluate:
+            policy, on = saved_policy(self.env, layers), self.settings.evaluate_on
+            rows = evaluate_policy(self.env, policy, chunk.step, on)
+            scores = summarise_episodes(rows)
+            self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
+            row |= {f"eval/{name}": value for name, value in scores.items()}
+            note = f"success {scores['success_rate']:.2f}, {note}"
+        row |= {"time/chunk_s": round(seconds, 3), "train/diverged": bool(learner.diverged)}
+        self.folder.append_metrics(row)
+        self._save(chunk, learner, layers)
+        if bool(learner.diverged):
+            note += ", DIVERGED: the policy stays as it was"
+        return learner, note
+
+    def _save(self, chunk: _Chunk, learner: Learner, layers: Layers) -> None:
+        save_policy(
+            self.folder.path / POLICY,
+            saved_policy(self.env, layers),
+            {
+                "env": self.settings.env,
+                "algorithm": self.settings.algorithm,
+                "seed": self.settings.seed,
+                "step": chunk.step,
+            },
+        )
+        checkpoint.save(self.folder.checkpoints, chunk.end, learner)
+
+    def finish(self, learner: Learner, wall_s: float) -> dict[str, Any]:
+        """Write and return the summary."""
+        settings = self.settings
+        rows = read_evaluation(self.folder.path)
+        scores = summarise_episodes([r for r in rows if r.step == settings.config.total_steps])
+        human = int(learner.counters.human_data)
+        summary = {
+            "env": settings.env,
+            "algorithm": settings.algorithm,
+            "seed": settings.seed,
+            "total_steps": settings.config.total_steps,
+            "human_data_usage": human,
+            "intervention_rate": human / settings.config.total_steps,
+            **scores,
+            "training_episodes": int(learner.counters.episodes),
+            "training_cost": float(learner.counters.cost),
+            "physics_diverged_episodes": int(learner.counters.physics_diverged),
+            "diverged": bool(learner.diverged),
+            "wall_s": round(wall_s, 1),
+            "compile_s": round(self.compile_s, 1),
+            "steps_per_s": round(self.trained_steps / max(self.train_s, 1e-9), 1),
+        }
+        self.folder.write_json(SUMMARY, summary)
+        return summary

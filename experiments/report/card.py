@@ -1,0 +1,110 @@
+"""A trained expert as two files to ship: its policy, and a card that says how it was made."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+from experiments.engine.evaluate import (
+    EvaluationRow,
+    policy_path,
+    read_evaluation,
+    summarise_episodes,
+)
+from experiments.engine.expert import settings_for
+from experiments.engine.run_folder import METRICS, SUMMARY, RunFolder
+from experiments.engine.runtime import UserError
+from experiments.report.tables import write_rows
+
+TRAINING = ("episodic_return", "episodic_cost", "success_rate", "multiplier", "action_std")
+
+
+def write_card(run: Path, out: Path) -> None:
+    """Write ENV.npz, ENV.json and ENV.csv (its curve) of a finished run of `ppl expert train`.
+
+    Args:
+        run: Run folder.
+        out: Folder to write to.
+
+    Raises:
+        UserError: If the run is none of an expert, or has not finished.
+    """
+    folder = RunFolder(run)
+    try:
+        config = folder.config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    if config["algorithm"] != "ppo_lagrangian" or not (run / SUMMARY).is_file():
+        raise UserError(f"{str(run)!r} is no finished run of `ppl expert train`")
+    summary, env = folder.read_json(SUMMARY), config["env"]
+    rows = read_evaluation(run)
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(policy_path(run), out / f"{env}.npz")
+    write_rows(out / f"{env}.csv", curve(folder, rows))
+    last = summarise_episodes([row for row in rows if row.step == summary["total_steps"]])
+    first = summarise_episodes([row for row in rows if row.step == rows[0].step])
+    card = {
+        "world": env,
+        "policy": f"{env}.npz",
+        "command": command_of(config),
+        "date": time.strftime("%Y-%m-%d", time.gmtime((run / SUMMARY).stat().st_mtime)),
+        "seed": config["seed"],
+        "steps": summary["total_steps"],
+        "demonstrations": config["config"]["demonstrations"],
+        "held_out": {name: round(value, 4) for name, value in last.items()},
+        f"held_out_at_{rows[0].step}_steps": {n: round(v, 4) for n, v in first.items()},
+        "curve": f"{env}.csv",
+        "hours": round(summary["wall_s"] / 3600, 2),
+        "steps_per_s": summary["steps_per_s"],
+        "config": config["config"],
+        "hparams": config["hparams"],
+        "device": config["device"],
+        "versions": config["versions"],
+        "revision": config["revision"],
+    }
+    (out / f"{env}.json").write_text(json.dumps(card, indent=2) + "\n")
+
+
+def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:
+    """A row per evaluation: means of training since the one before, and the held-out scenarios."""
+    with open(folder.path / METRICS) as file:
+        logged = [json.loads(line) for line in file]
+    table, before = [], -1
+    for step in sorted({row.step for row in rows}):
+        batches = [line for line in logged if before < line["step"] <= step]
+        line: dict[str, Any] = {"step": step}
+        for name in TRAINING:
+            values = [b[f"train/{name}"] for b in batches if f"train/{name}" in b]
+            line[f"train_{name}"] = f"{sum(values) / len(values):.5g}" if values else ""
+        scores = summarise_episodes([row for row in rows if row.step == step])
+        line |= {f"held_out_{name}": f"{value:.5g}" for name, value in scores.items()}
+        table.append(line)
+        before = step
+    return table
+
+
+def command_of(config: dict[str, Any]) -> str:
+    """The command line that makes a run again, given the defaults of this version."""
+    words = ["ppl", "expert", "train", config["env"]]
+    static, traced, training = settings_for(config["env"])
+    defaults = {**dataclasses.asdict(static), **dataclasses.asdict(traced), "seed": 0}
+    defaults |= {"training_scenarios": training, "scenarios": None, "held_out_scenarios": None}
+    given = config | config["config"] | config["hparams"]
+    for name, default in defaults.items():
+        value = given.get(name, default)
+        value = tuple(value) if isinstance(value, list) else value
+        if value != default:
+            shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            words += [f"--{name.replace('_', '-')}", shown]
+    return " ".join(words)
+
+
+def read_curve(path: Path) -> list[dict[str, float]]:
+    """A curve's rows as numbers; what was not measured is left out."""
+    with open(path, newline="") as file:
+        return [{k: float(v) for k, v in row.items() if v != ""} for row in csv.DictReader(file)]

@@ -1,0 +1,116 @@
+"""Film of one episode with the predictions the expert would see."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.driving.rendering import Paths, Scene, draw, save_frames
+from envs.driving.scenario import tree_index
+from experiments.engine.evaluate import make_world, named_expert, run_options
+from experiments.engine.runtime import UserError
+from ppl_jax.config import default
+from ppl_jax.gates import RULES
+from ppl_jax.predictors import predict
+from ppl_jax.types import Env, Expert
+
+SUFFIXES = (".gif", ".mp4", ".png")
+
+Draw = Callable[[Any, np.ndarray, bool, np.ndarray, str], np.ndarray]
+"""`draw(state, novice's path, takeover, expert's path, caption) -> picture`."""
+
+
+def render(run: str, number: int, out: Path, steps: int, world: str = "driving") -> None:
+    """Play a held-out scenario and write the film.
+
+    Args:
+        run: Run folder, policy file, "scripted" or "neural".
+        number: Of the scenario.
+        out: .gif, .mp4 or .png (the last picture).
+        steps: At most so many.
+        world: Where `run` is "scripted" or "neural".
+
+    Raises:
+        UserError: If one of them cannot be used.
+    """
+    if out.suffix not in SUFFIXES:
+        raise UserError(f"out must end in {', '.join(SUFFIXES)}, got {str(out)!r}")
+    if steps < 1:
+        raise UserError(f"steps must be at least 1, got {steps}")
+    named = run in ("scripted", "neural")
+    name, options = (world, {}) if named else run_options(Path(run))
+    env = make_world(name, options)
+    save_frames(out, episode(env, named_expert(run, env), number, steps))
+
+
+def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
+    """Pictures of an episode, one per control step.
+
+    Raises:
+        UserError: If the world has no scenario of that number, or cannot be drawn here.
+    """
+    params = env.held_out_params
+    numbers = np.asarray(env.scenario_numbers(params)).tolist()
+    if number not in numbers:
+        raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
+    config, hparams = default(env.name)
+    rule, key = RULES[config.gate], jax.random.key(0)
+    state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
+    if env.name == "driving":
+        place, picture = _driving(env, state)
+    else:
+        place, picture = _arm(env)
+    horizon = config.prediction_horizon
+
+    ahead = functools.partial(predict, env, env.transition, key, place=place)
+
+    @jax.jit
+    def step(state: Any):
+        action = act(key, state, env.observe(state, params), params)
+        novice = ahead(state, action, params, horizon)
+        expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
+        after, outcome = env.transition(key, state, action, params)
+        takeover = rule(novice, None, hparams, env.spec.observation_scale)
+        return after, outcome, novice.position, takeover, expert.position
+
+    frames = []
+    for t in range(steps):
+        after, outcome, novice, takeover, expert = step(state)
+        caption = f"scenario {number}   step {t}   speed {float(outcome.speed):.2f} m/s"
+        frames.append(
+            picture(state, np.asarray(novice), bool(takeover), np.asarray(expert), caption)
+        )
+        state = after
+        if bool(outcome.terminated):
+            break
+    return frames
+
+
+def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    scene = Scene(tree_index(env.held_out_params.scenarios, state.scenario))
+
+    def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
+        return draw(scene, state, Paths(novice, takeover, expert), caption=caption)
+
+    return (lambda state: state.ego.pose[:2]), picture
+
+
+def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    try:
+        from envs.manipulation.rendering import ArmPaths, ArmScene
+
+        scene = ArmScene(env)
+    except (ImportError, RuntimeError) as error:
+        raise UserError(str(error)) from error
+
+    def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
+        del caption
+        return scene.draw(state, ArmPaths(novice, takeover, expert))
+
+    return env.grip_position, picture

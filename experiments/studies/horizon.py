@@ -1,0 +1,91 @@
+"""`ppl horizon`: what a longer preference horizon buys and costs, along runs of PPL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+from experiments.engine.progress import Progress
+from experiments.engine.run import algorithm_factory, check, make_env_and_expert
+from experiments.engine.runtime import UserError
+from experiments.report.tables import write_rows
+from ppl_jax import experts
+from ppl_jax.experts import SavedPolicy
+from ppl_jax.horizon import errors, make_profile
+from ppl_jax.interaction import Learner
+from ppl_jax.training import make_train
+
+if TYPE_CHECKING:
+    from experiments.cli import Horizon
+
+MEASUREMENTS = 5  # over a run, unless asked for otherwise
+
+
+def measure_horizon(command: Horizon) -> None:
+    """Train, stop now and then to measure, and write a row per stop and predicted step.
+
+    Raises:
+        UserError: If a setting cannot work.
+    """
+    from experiments.cli import Train, run_settings
+
+    if command.seeds < 1:
+        raise UserError(f"seeds must be at least 1, got {command.seeds}")
+    given = {"total_steps": command.total_steps, "batch_size": command.batch_size}
+    settings = run_settings(Train(command.env, expert=command.expert, **given))
+    config = settings.config
+    interval = config.decision_interval
+    every = command.measure_every
+    if every is None:
+        every = max(config.total_steps // MEASUREMENTS // interval, 1) * interval
+    if every < 1 or every % interval or every > config.total_steps:
+        raise UserError(
+            f"measure_every must be a multiple of decision_interval ({interval}) up to "
+            f"total_steps ({config.total_steps}), got {every}"
+        )
+    check(settings)
+    env, expert = make_env_and_expert(settings)
+    functions = make_train(env, expert, algorithm_factory(settings, env), config)
+    try:
+        profile = make_profile(env, expert, config)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    chunk = jax.jit(lambda learner: functions.run_chunk(learner, every // interval)[0])
+
+    @jax.jit
+    def look(key: jax.Array, learner: Learner) -> Any:
+        layers = functions.algorithm.policy(learner.algorithm)
+        mean, scale = env.spec.observation_mean, env.spec.observation_scale
+        policy = SavedPolicy(layers, "relu", "tanh", mean, scale)
+        return profile(key, lambda observation: experts.act(policy, observation), learner.hparams)
+
+    rows, stops = [], config.total_steps // every
+    with Progress(command.seeds * stops, f"measure {command.env}") as progress:
+        progress.start()
+        for seed in range(command.seeds):
+            learner = jax.jit(functions.init)(jax.random.key(seed), settings.hparams)
+            for stop in range(1, stops + 1):
+                learner = chunk(learner)
+                found = look(jax.random.fold_in(jax.random.key(seed), stop), learner)
+                rows += _rows(command.env, seed, stop * every, found)
+                write_rows(command.out, rows)
+                note = f"seed {seed} step {stop * every}: {rows[-1]['interventions']} takeovers"
+                progress.update(seed * stops + stop, note)
+
+
+def _rows(env: str, seed: int, step: int, found: Any) -> list[dict[str, Any]]:
+    gap, error = errors(found.drift, found.reach, found.apart)
+    columns = {
+        "wrong": found.wrong,
+        "drift": found.drift,
+        "reach": found.reach,
+        "coverage": found.coverage,
+        "gap": gap,
+        "error": error,
+    }
+    where = {"env": env, "seed": seed, "step": step, "interventions": int(found.interventions)}
+    return [
+        where | {"predicted_step": i + 1} | {k: f"{float(v[i]):.5g}" for k, v in columns.items()}
+        for i in range(found.wrong.shape[0])
+    ]

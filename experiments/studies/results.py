@@ -1,0 +1,172 @@
+"""The result files of a sweep: appended run by run, so that a kill costs what was under way."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.engine.runtime import UserError
+from experiments.report.tables import EPISODES, RESULTS
+from experiments.studies.grid import Run, plain, show
+from ppl_jax.sweep import evaluation_steps
+
+DONE, DIVERGED, FAILED = "done", "diverged", "failed"
+SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
+COUNTS = ("human_data_usage", "takeovers", "training_cost")
+_STATIC = (
+    "prediction_horizon",
+    "batch_size",
+    "predictor",
+    "gate",
+    "likelihood",
+    "objective",
+    "total_steps",
+)
+
+
+class Results:
+    """results.csv (a row per run and evaluation) and episodes.csv (a row per held-out scenario).
+
+    Args:
+        out: Folder of both.
+        runs: Of the sweep, in order.
+    """
+
+    def __init__(self, out: Path, runs: Sequence[Run]):
+        self.out, self.runs = out, list(runs)
+        self.rows: dict[str, list[dict[str, str]]] = {}
+        self.failures: dict[str, list[dict[str, str]]] = {}
+        self.kept: dict[str, tuple[list[dict[str, str]], list[dict[str, str]]]] = {}
+        self.episodes: dict[str, list[dict[str, str]]] = {}
+        axes = dict.fromkeys(name for run in runs for name, _ in run.values)
+        traced = [field.name for field in dataclasses.fields(runs[0].settings.hparams)]
+        own = [name for name in axes if name not in traced and name not in _STATIC]
+        where = ["run", "env", "algorithm", "seed"]
+        self.columns = [*where, "status", "step", *COUNTS, *SCORES, *_STATIC, *own, *traced]
+        self.episode_columns = [*where, *axes, "step", "human_data_usage", "scenario", *SCORES]
+
+    @property
+    def count(self) -> int:
+        """Runs whose results are there."""
+        return len(self.rows)
+
+    def read(self) -> set[str]:
+        """Names of the runs that are there whole; what a kill cut off is dropped.
+
+        Runs that the sweep does not name are kept.
+
+        Raises:
+            UserError: If the files have other columns.
+        """
+        rows = _read(self.out / RESULTS, self.columns)
+        episodes = _read(self.out / EPISODES, self.episode_columns)
+        named = {run.name for run in self.runs}
+        self.kept = {
+            name: (mine, episodes.get(name, [])) for name, mine in rows.items() if name not in named
+        }
+        for run in self.runs:
+            mine, played = rows.get(run.name, []), episodes.get(run.name, [])
+            steps = evaluation_steps(run.settings.config, run.settings.evaluate_every)
+            if [row.get("step") for row in mine] == [str(step) for step in steps] and played:
+                whole = {int(row["scenario"]) for row in played}
+                if len(whole) == len(played):
+                    self.rows[run.name], self.episodes[run.name] = mine, played
+        if rows or episodes:
+            self.write_sorted()
+        return set(self.rows)
+
+    def add(self, run: Run, reply: dict[str, Any]) -> None:
+        """A run that came back: its rows go to the files at once."""
+        self.episodes[run.name] = [
+            self._episode(run, reply["rows"][-1], row) for row in reply["episodes"]
+        ]
+        self.rows[run.name] = [self._row(run, row) for row in reply["rows"]]
+        _append(self.out / EPISODES, self.episode_columns, self.episodes[run.name])
+        _append(self.out / RESULTS, self.columns, self.rows[run.name])
+
+    def fail(self, run: Run, why: str) -> None:
+        """A run that failed is a row too, with the reason for its status."""
+        self.failures[run.name] = [self._row(run, {"status": f"{FAILED}: {why}"})]
+        _append(self.out / RESULTS, self.columns, self.failures[run.name])
+
+    def _where(self, run: Run) -> dict[str, Any]:
+        settings = run.settings
+        return {
+            "run": run.name,
+            "env": settings.env,
+            "algorithm": settings.algorithm,
+            "seed": settings.seed,
+        }
+
+    def _row(self, run: Run, row: dict[str, Any]) -> dict[str, str]:
+        settings = run.settings
+        hparams = {k: f"{v:g}" for k, v in dataclasses.asdict(settings.hparams).items()}
+        static = {name: getattr(settings.config, name) for name in _STATIC}
+        whole = self._where(run) | static | hparams | dict(run.values) | row
+        return {name: plain(whole.get(name, "")) for name in self.columns}
+
+    def _episode(self, run: Run, last: dict[str, Any], row: dict[str, Any]) -> dict[str, str]:
+        whole = self._where(run) | dict(run.values) | row
+        whole |= {"human_data_usage": last["human_data_usage"]}
+        return {name: plain(whole.get(name, "")) for name in self.episode_columns}
+
+    def note(self, run: Run) -> str:
+        """The run that just came, and the best settings so far."""
+        if run.name not in self.rows:
+            return f"{run.name} FAILED"
+        last = self.rows[run.name][-1]
+        means: dict[tuple[str, ...], list[float]] = {}
+        for other in self.runs:
+            if other.name in self.rows:
+                settings = other.settings
+                key = (settings.env, settings.algorithm, show(dict(other.values)))
+                means.setdefault(key, []).append(float(self.rows[other.name][-1]["success"]))
+        best = max(means, key=lambda key: sum(means[key]) / len(means[key]))
+        score = sum(means[best]) / len(means[best])
+        state = f"success {float(last['success']):.2f}"
+        if last["status"] != DONE:
+            state += f" ({last['status'].upper()})"
+        return f"{run.name} {state}; best so far {' '.join(best).strip()} {score:.2f}"
+
+    def write_sorted(self) -> None:
+        """Both files anew, in the order of the runs: the same however often it was resumed."""
+        for at, name, columns, found in (
+            (0, RESULTS, self.columns, self.rows | self.failures),
+            (1, EPISODES, self.episode_columns, self.episodes),
+        ):
+            rows = [row for run in self.runs for row in found.get(run.name, [])]
+            rows += [row for kept in self.kept.values() for row in kept[at]]
+            path = self.out / name
+            temporary = path.with_suffix(".tmp")
+            with open(temporary, "w", newline="") as file:
+                writer = csv.DictWriter(file, columns, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+            os.replace(temporary, path)
+
+
+def _read(path: Path, columns: Sequence[str]) -> dict[str, list[dict[str, str]]]:
+    """Rows by run; a last line without its end is left out."""
+    text = path.read_text() if path.is_file() else ""
+    reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
+    if reader.fieldnames and list(reader.fieldnames) != list(columns):
+        raise UserError(f"{str(path)!r} has the columns of another sweep: give another --out")
+    found: dict[str, list[dict[str, str]]] = {}
+    for row in reader:
+        found.setdefault(row["run"], []).append(row)
+    return found
+
+
+def _append(path: Path, columns: Sequence[str], rows: Sequence[dict[str, str]]) -> None:
+    new = not path.is_file()
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerows(rows)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,270 @@
+"""`ppl sweep`: plans the runs of a grid, has an engine run them and keeps their results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.engine import schedulers as engines
+from experiments.engine.progress import Progress
+from experiments.engine.run import RunSettings, check
+from experiments.engine.runtime import UserError, revision, versions
+from experiments.engine.worker import Job, Reply
+from experiments.studies.grid import STUDIES, Group, Run, group_key, groups, points, run_name, widen
+from experiments.studies.results import Results
+
+if TYPE_CHECKING:
+    from experiments.cli import Sweep
+
+SETTINGS = "sweep.json"
+LOG = "workers.log"
+COST = {"driving": 5.0, "table_wiping": 5.0, "nut_assembly": 10.0}  # ms a step, one core, batch 256
+COMPILE_S = 25.0  # of a program that was never compiled before
+
+
+def plan(command: Sweep) -> list[Run]:
+    """The runs that a command asks for.
+
+    Raises:
+        UserError: If a setting cannot work, before anything is built.
+    """
+    study = STUDIES[command.study] if command.study else None
+    algorithms = command.algorithms or (study.algorithms if study else ("ppl",))
+    runs = []
+    for env in command.envs:
+        for algorithm in algorithms:
+            for values in points(_axes(command, env)):
+                for seed in range(command.seeds):
+                    settings = _settings(command, env, algorithm, values, seed)
+                    if settings is not None:
+                        name = run_name(env, algorithm, values, seed)
+                        runs.append(Run(name, tuple(values.items()), settings))
+    return widen(runs)
+
+
+def _axes(command: Sweep, env: str) -> dict[str, tuple[Any, ...]]:
+    given = {name: values for name, values in vars(command.axes).items() if values}
+    study = dict(STUDIES[command.study].axes) if command.study else {}
+    if env != "driving" and command.study == "predictor" and "predictor" not in given:
+        raise UserError(f"study predictor is for driving, which alone has two, got {env}")
+    return study | given
+
+
+def _settings(
+    command: Sweep, env: str, algorithm: str, values: dict[str, Any], seed: int
+) -> RunSettings | None:
+    """Of one run; None where a study's L exceeds what the world predicts."""
+    from experiments.cli import Train, default_interval, run_settings
+
+    common = {name: getattr(command, name) for name in _COMMON}
+    settings = run_settings(Train(env, algorithm, seed, **common, **values))
+    config = settings.config
+    study = STUDIES[command.study] if command.study else None
+    if study and command.total_steps is None and study.length != 1:
+        config = dataclasses.replace(config, total_steps=int(config.total_steps * study.length))
+    every = command.evaluate_every
+    if every is None:
+        every = default_interval(config)
+        if study:
+            left, interval = config.total_steps - config.demonstrations, config.decision_interval
+            every = max(left // study.evaluations // interval, 1) * interval
+    settings = dataclasses.replace(settings, config=config, evaluate_every=every)
+    given = vars(command.axes)["preference_horizon"]
+    if study and not given and settings.hparams.preference_horizon > config.prediction_horizon:
+        return None
+    check(settings)
+    return settings
+
+
+_COMMON = ("preset", "total_steps", "expert", "scenarios", "held_out_scenarios")
+
+
+def sweep(command: Sweep) -> None:
+    """Run what is not there yet, and write results as they come.
+
+    Raises:
+        UserError: If a setting is wrong, or a run failed (the others go on).
+    """
+    for name, least in (("seeds", 1), ("processes", 1), ("batch", 1)):
+        value = getattr(command, name)
+        if value is not None and value < least:
+            raise UserError(f"{name} must be at least {least}, got {value}")
+    if not command.envs:
+        raise UserError("envs: name at least one world")
+    runs = plan(command)
+    results = Results(command.out, runs)
+    content = {"runs": {run.name: _json(run.settings) for run in runs}}
+    if command.dry_run:
+        _tell_plan(runs, runs, command)
+        return
+    _open(command.out, content)
+    done = results.read()
+    waiting = [run for run in runs if run.name not in done]
+    batch = _tell_plan(runs, waiting, command)
+    jobs = list(_jobs(groups(waiting), runs, batch))
+    log = command.out / LOG
+    failed = {}
+    with Progress(len(runs), "runs", len(done)) as progress:
+        progress.start()
+        for number, reply in _engine(command, [job for job, _ in jobs], log):
+            compiling = reply.get("compile_s", 0.0) / _workers(command)
+            progress.began += compiling  # says nothing of what is left
+            for run, rows in _replies(reply, jobs[number], runs):
+                if isinstance(rows, str):
+                    failed[run.name] = rows
+                    results.fail(run, rows)
+                else:
+                    results.add(run, rows)
+                progress.update(results.count + len(failed), results.note(run))
+    results.write_sorted()
+    if failed:
+        name, why = next(iter(failed.items()))
+        raise UserError(
+            f"{len(failed)} of {len(runs)} runs failed (the same command tries them again); "
+            f"{name}: {why}"
+        )
+
+
+def _json(settings: RunSettings) -> dict[str, Any]:
+    return json.loads(json.dumps(settings.as_json()))
+
+
+def _open(out: Path, content: dict[str, Any]) -> None:
+    """Make the folder of a sweep, or check that what is in it has the same settings.
+
+    More runs (seeds, values) may join; those that are there must be the same.
+
+    Raises:
+        UserError: If they are not.
+    """
+    path = out / SETTINGS
+    if path.is_file():
+        before = json.loads(path.read_text())["runs"]
+        for name, settings in content["runs"].items():
+            for field, value in settings.items():
+                if name in before and before[name].get(field) != value:
+                    raise UserError(
+                        f"{str(out)!r} holds {name} with {field} {before[name].get(field)!r}, "
+                        f"asked for {value!r}: give another --out"
+                    )
+        content = {"runs": before | content["runs"]}
+    elif out.is_dir() and any(out.iterdir()):
+        raise UserError(f"{str(out)!r} holds something else: give another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    about = {"versions": versions(), "revision": revision()}
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(about | content, indent=1) + "\n")
+    os.replace(temporary, path)
+
+
+def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:
+    """Say how much work it is; returns the runs per batch."""
+    from experiments.engine.run import algorithm_factory, make_env_and_expert
+    from ppl_jax.sweep import run_bytes
+    from ppl_jax.training import make_train
+
+    wanted = groups(waiting)
+    steps = sum(run.settings.config.total_steps for run in waiting)
+    workers = _workers(command)
+    seconds = sum(
+        COST.get(run.settings.env, 5.0)
+        * run.settings.config.total_steps
+        * run.settings.config.batch_size
+        / 256e3
+        for run in waiting
+    )
+    memory = 0
+    for group in wanted if command.engine == "local" else ():
+        env, expert = make_env_and_expert(group.settings)
+        try:
+            made = make_train(
+                env, expert, algorithm_factory(group.settings, env), group.settings.config
+            )
+        except ValueError:
+            continue  # its runs will say so; the others go on
+        memory = max(memory, run_bytes(made, group.settings.hparams))
+    batch = command.batch or _batch(memory, len(waiting))
+    compiles = len({(group_key(g.settings), min(len(g.runs), batch)) for g in wanted})
+    minutes = (seconds + COMPILE_S * compiles * min(workers, 2)) / workers / 60
+    print(
+        f"{len(runs)} runs, {len(runs) - len(waiting)} of them done; {steps:,} steps to go in "
+        f"{len(wanted)} groups: {compiles} programs to compile, on {workers} workers with "
+        f"{batch} run{'s' if batch > 1 else ''} at a time, {memory * batch / 2**20:.0f} MB each; "
+        f"about {minutes:.0f} min",
+        file=sys.stderr,
+    )
+    return batch
+
+
+def _accelerated() -> bool:
+    import jax
+
+    return jax.default_backend() != "cpu"
+
+
+def _workers(command: Sweep) -> int:
+    return 1 if command.engine == "local" and _accelerated() else command.processes
+
+
+def _batch(run_bytes: int, runs: int) -> int:
+    """Runs stepped side by side: on a CPU one; on accelerators what memory holds, evenly split."""
+    import jax
+
+    if not _accelerated():
+        return 1
+    devices = jax.devices()
+    stats = devices[0].memory_stats() or {}
+    room = 0.5 * stats.get("bytes_limit", 2**33)  # the other half is for temporaries
+    most = max(int(room // (2 * max(run_bytes, 1))), 1)
+    return min(most, -(-runs // len(devices))) * len(devices)
+
+
+def _jobs(
+    wanted: Sequence[Group], runs: Sequence[Run], batch: int
+) -> Iterator[tuple[Job, list[Run]]]:
+    """Batches of each group; the last is filled up with copies, so that one program serves all."""
+    index = {run.name: number for number, run in enumerate(runs)}
+    for group in wanted:
+        size = min(batch, len(group.runs)) if not _accelerated() else batch
+        for start in range(0, len(group.runs), size):
+            mine = group.runs[start : start + size]
+            filled = mine + [mine[-1]] * (size - len(mine))
+            job = {
+                "settings": _json(dataclasses.replace(group.settings, seed=0)),
+                "side_by_side": _accelerated(),
+                "runs": [
+                    {
+                        "index": index[run.name],
+                        "seed": run.settings.seed,
+                        "hparams": run.settings.as_json()["hparams"],
+                    }
+                    for run in filled
+                ],
+            }
+            yield job, mine
+
+
+def _engine(command: Sweep, jobs: Sequence[Job], log: Path) -> Iterator[tuple[int, Reply]]:
+    if command.engine == "ray":
+        return engines.ray_cluster(jobs, command.address)
+    if _accelerated():
+        return engines.here(jobs)
+    return engines.local(jobs, command.processes, log)
+
+
+def _replies(
+    reply: Reply, job: tuple[Job, list[Run]], runs: Sequence[Run]
+) -> Iterator[tuple[Run, dict[str, Any] | str]]:
+    """Each run of a job with its rows, or with what went wrong."""
+    if "error" in reply:
+        for run in job[1]:
+            yield run, reply["error"]
+        return
+    found = {answer["index"]: answer for answer in reply["runs"]}  # copies fall together
+    for number, answer in found.items():
+        yield runs[number], answer

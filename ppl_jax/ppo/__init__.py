@@ -1,0 +1,1 @@
+"""PPO-Lagrangian, which trains the neural experts."""

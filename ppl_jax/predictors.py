@@ -1,0 +1,107 @@
+"""The predictor f(s, a, H): what would happen if an action were held for H steps.
+
+It rolls any transition function forward by value, so the state it started from is untouched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ppl_jax.types import Env, Expert, Trajectory, Transition
+
+Act = Callable[[jax.Array], jax.Array]
+"""`act(observation [O]) -> action [A]`."""
+
+
+def predict(
+    env: Env,
+    transition: Transition,
+    key: jax.Array,
+    state: Any,
+    action: jax.Array,
+    params: Any,
+    horizon: int,
+    observe: bool = False,
+    act: Act | None = None,
+    expert: Expert | None = None,
+    labelling_expert: Expert | None = None,
+    place: Callable[[Any], jax.Array] | None = None,
+) -> Trajectory:
+    """Roll `horizon` steps from `state`.
+
+    After the prediction has ended, its state stays as it was and its steps are not `valid`.
+
+    Args:
+        env: For observations.
+        transition: The world's own, or another (see `ppl_jax.types.Transition`).
+        key: For a random transition.
+        state: Start.
+        action: [A] held through the prediction, or only its first action where `act` is given.
+        params: Of the world.
+        horizon: H, static.
+        observe: Also return the observation of every predicted state.
+        act: Policy asked again at every predicted state (the released code's gate).
+        expert: Expert asked at every predicted state, the first included; `action` is ignored.
+        labelling_expert: Expert that only says what it would do at every predicted state.
+        place: `place(state) -> position [P]`, to see where it goes.
+    """
+
+    def step(carry: Any, key: jax.Array) -> tuple[Any, Trajectory]:
+        state, action, alive = carry
+        if expert is not None:
+            key, key_expert = jax.random.split(key)
+            action = expert(key_expert, state, env.observe(state, params), params)
+        after, outcome = transition(key, state, action, params)
+        after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
+        empty = jnp.zeros((0,), jnp.float32)
+        observation = env.observe(after, params) if observe or act is not None else empty
+        if act is not None:
+            action = act(observation)
+        expert_actions = None
+        if labelling_expert is not None:
+            expert_actions = labelling_expert(key, after, env.observe(after, params), params)
+        predicted = Trajectory(
+            observation=observation if observe else empty,
+            reward=jnp.where(alive, outcome.reward, 0.0),
+            speed=jnp.where(alive, outcome.speed, 0.0),
+            unsafe=alive & outcome.unsafe,
+            success=alive & outcome.success,
+            terminated=alive & outcome.terminated,
+            valid=alive,
+            expert_actions=expert_actions,
+            position=None if place is None else place(after),
+        )
+        alive = alive & ~(outcome.terminated | outcome.truncated)
+        return (after, action, alive), predicted
+
+    keys = jax.random.split(key, horizon)
+    return jax.lax.scan(step, (state, action, jnp.ones((), bool)), keys)[1]
+
+
+def add_noise(key: jax.Array, observation: jax.Array, epsilon: jax.Array | float) -> jax.Array:
+    """Disturb predicted observations [..., O] by Gaussian noise e scaled to |e| = epsilon |s|.
+
+    The paper's robustness study ("imperfect predictors").
+    """
+    noise = jax.random.normal(key, observation.shape)
+    norm = jnp.linalg.norm(observation, axis=-1, keepdims=True)
+    length = jnp.linalg.norm(noise, axis=-1, keepdims=True)
+    return observation + epsilon * norm / jnp.maximum(length, 1e-12) * noise
+
+
+def selected_transition(env: Env, predictor: str) -> Transition:
+    """The transition a `TrainConfig.predictor` names.
+
+    Raises:
+        ValueError: If the world has no such predictor.
+    """
+    if predictor == "simulator":
+        return env.transition
+    transition = getattr(env, "transition_kinematic", None)
+    if predictor != "kinematic" or transition is None:
+        raise ValueError(f"environment {env.name!r} has no predictor {predictor!r}")
+    return transition

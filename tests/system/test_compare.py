@@ -1,0 +1,217 @@
+"""Host loop and comparisons, on the probe world: phases, resume, failures, tables."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import envs
+from experiments.engine.run import RunSettings, train
+from experiments.report import paper, tables
+from experiments.studies.ablation import LIBRARY, ROWS
+from experiments.studies.tune import GRID, points
+from ppl_jax import algorithms, checkpoint
+from tests.helpers import Probe
+from tests.unit.test_algorithms import probe_settings
+
+ROOT = Path(__file__).parent.parent.parent
+if "probe" not in envs.registered():
+    envs.register("probe", Probe)
+
+PROGRAM = """
+import envs
+from experiments.cli import main
+from ppl_jax.algorithms import register
+from tests.helpers import Probe
+
+def broken(spec, config):
+    raise ValueError("this method is broken")
+
+envs.register("probe", Probe)
+register("broken", broken)
+if __name__ == "__main__":
+    main()
+"""
+
+
+def run_settings(name):
+    changes = {"total_steps": 60, "rollout_steps": 20, "batch_size": 8, "human_capacity": 60}
+    phased = name in ("bc", "gail", "thrifty_dagger")
+    changes |= {"demonstrations": 20, "offline_updates": 20} if phased else {}
+    if name == "bc":
+        changes["total_steps"] = 20
+    config, hparams = probe_settings(name, **changes)
+    return RunSettings("probe", name, 0, config, hparams, evaluate_every=20)
+
+
+def outcome(out):
+    newest = out / "checkpoints" / f"step_{checkpoint.steps(out / 'checkpoints')[-1]}"
+    lines = (out / "metrics.jsonl").read_text().splitlines()
+    return {
+        "learner": json.loads((newest / "checksum.json").read_text())["crc32"],
+        "evaluation": (out / "evaluation.csv").read_text(),
+        "metrics": [
+            {k: v for k, v in json.loads(line).items() if not k.startswith("time/")}
+            for line in lines
+        ],
+    }
+
+
+@pytest.mark.parametrize("name", ["bc", "gail", "thrifty_dagger", "haco"])
+def test_a_run_stopped_in_any_phase_goes_on_bit_for_bit(name, tmp_path, monkeypatch):
+    settings = run_settings(name)
+    summary = train(settings, tmp_path / "whole")
+    whole = outcome(tmp_path / "whole")
+    saves = len(whole["metrics"])
+    assert saves == {"bc": 2, "gail": 4, "thrifty_dagger": 4, "haco": 3}[name]
+    steps = [row["step"] for row in whole["metrics"]]
+    assert steps == {"bc": [20, 20], "haco": [20, 40, 60]}.get(name, [20, 20, 40, 60])
+    # demonstrations alone are not evaluated; what they taught is
+    rows = list(csv.DictReader(whole["evaluation"].splitlines()))
+    assert sorted({int(row["step"]) for row in rows}) == sorted(set(steps))
+    assert len(rows) == 2 * len(set(steps))  # every held-out scenario once
+    assert summary["human_data_usage"] >= settings.config.demonstrations
+    really = checkpoint.save
+    for stop in range(1, saves + 1):
+        made = []
+
+        def save(*args, made=made, stop=stop):
+            if len(made) + 1 == stop:  # killed after logging, before this checkpoint is there
+                raise KeyboardInterrupt
+            made.append(really(*args))
+
+        out = tmp_path / f"stopped-{stop}"
+        monkeypatch.setattr(checkpoint, "save", save)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings, out)
+        monkeypatch.setattr(checkpoint, "save", really)
+        train(settings, out, resume=True)
+        assert outcome(out) == whole
+
+
+def program(tmp_path, *words, code=0):
+    script = tmp_path / "own.py"
+    script.write_text(PROGRAM)
+    return call(script, *words, code=code)
+
+
+def call(script, *words, code=0):
+    done = subprocess.run(
+        [sys.executable, str(script), *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=560,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done
+
+
+SMALL = ["--seeds", "2", "--total-steps", "40", "--evaluate-every", "20", "--batch-size", "8"]
+
+
+def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp_path):
+    out = tmp_path / "c"
+    words = ["compare", "probe", "--algorithms", "hg_dagger", "broken", "pvp", *SMALL, "--out", out]
+    done = program(tmp_path, *words, code=2)
+    assert "broken-0" in done.stderr
+    assert "this method is broken" in done.stderr
+    assert "4 of 6 are there" in done.stderr
+    assert "6/6" in done.stderr  # progress
+    assert "hg_dagger" in done.stdout
+    assert "pvp" in done.stdout
+    with open(out / "results.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 2  # methods x seeds x evaluations
+    with open(out / "episodes.csv", newline="") as file:
+        episodes = list(csv.DictReader(file))
+    assert len(episodes) == 2 * 2 * 2  # methods x seeds x scenarios
+    last = [row for row in rows if row["step"] == "40" and row["algorithm"] == "pvp"]
+    for row in last:
+        mine = [e for e in episodes if (e["algorithm"], e["seed"]) == ("pvp", row["seed"])]
+        assert float(row["success"]) == np.mean([float(e["success"]) for e in mine])
+        assert row["discount"] == "0.9"  # every hyper-parameter is a column
+    before = {path: path.stat().st_mtime for path in out.rglob("summary.json")}
+    assert len(before) == 4
+    again = program(tmp_path, *words, code=2)
+    assert {path: path.stat().st_mtime for path in out.rglob("summary.json")} == before
+    assert again.stdout == done.stdout
+    other = program(tmp_path, *words[:-2], "--gate", "deviates_from_expert", "--out", out, code=2)
+    assert not (out / "broken-0" / "summary.json").exists()
+    assert (
+        "were made with gate None, asked for 'deviates_from_expert': give another --out"
+        in other.stderr
+    )
+    (out / "settings.json").unlink()
+    unknown = program(tmp_path, *words, code=2)
+    assert "holds runs of something else: give another --out" in unknown.stderr
+
+
+@pytest.mark.slow
+def test_every_row_of_the_ablation_runs(tmp_path):
+    out = tmp_path / "a"
+    words = ["ablation", "probe", *SMALL, "--reference-steps", "40", "--out", out]
+    done = program(tmp_path, *words)
+    for label in (ROWS | LIBRARY).keys() - {"rule-based f"}:
+        assert label in done.stdout
+    assert "from another simulator" in done.stdout
+
+
+def test_the_paper_s_figures_stand_beside_ours_and_are_marked(tmp_path, capsys):
+    columns = ["algorithm", "seed", "total_steps", "training_cost", "scenario", "success"]
+    columns += ["progress", "episodic_return", "episodic_cost", "length", "human_data_usage"]
+    rows = []
+    for algorithm, total, good in (("ppl", 100, 1), ("bc", 50, 0), ("focused", 100, 1)):
+        for seed in range(2):
+            for scenario in range(3):
+                values = [algorithm, seed, total, 3, scenario, good, 0.5, 7, 1, 9, 30]
+                rows.append(dict(zip(columns, values, strict=True)))
+    tables.write_rows(tmp_path / "episodes.csv", rows)
+    tables.print_comparison(tmp_path / "episodes.csv", paper.METHODS["driving"])
+    ppl, bc, own = capsys.readouterr().out.splitlines()[2:5]
+    assert "30 (0.30)" in ppl
+    assert "0.80±0.04, 329.9±13.4, 0.92±0.03" in ppl
+    assert "30 (0.60)" in bc
+    assert "0.12±0.04" in bc
+    assert own.rstrip().endswith("-")
+
+
+def test_all_methods_have_a_grid_of_the_same_size_and_the_paper_s_row():
+    names = algorithms.registered(variants=False)
+    assert len(names) == 10
+    assert set(GRID) == set(names) == set(paper.METHODS["driving"])
+    assert {len(points(name)) for name in names} == {4}
+    assert set(ROWS) == set(paper.ABLATION)
+    assert len(ROWS) == 10
+
+
+def test_a_method_is_registered_once_and_with_known_fields():
+    with pytest.raises(ValueError, match="'ppl' is registered already"):
+        algorithms.register("ppl", algorithms.method("ppl").make)
+    with pytest.raises(ValueError, match="changes unknown fields: learning_speed"):
+        algorithms.register("x", algorithms.method("ppl").make, {"learning_speed": 1.0})
+    with pytest.raises(ValueError, match="unknown algorithm 'magic': choose one of ppl, bc"):
+        algorithms.method("magic")
+
+
+def test_the_example_of_an_own_method_runs_from_outside(tmp_path):
+    example = ROOT / "experiments" / "examples" / "own_method.py"
+    assert len(example.read_text().splitlines()) <= 80
+    script = tmp_path / "own_method.py"
+    script.write_text(
+        example.read_text().replace(
+            'if __name__ == "__main__":',
+            "import envs\nfrom tests.helpers import Probe\nenvs.register('probe', Probe)\n"
+            'if __name__ == "__main__":',
+        )
+    )
+    words = ["compare", "probe", "--algorithms", "ppl", "focused", "--seeds", "1"]
+    words += ["--total-steps", "400", "--batch-size", "32", "--out", tmp_path / "c"]
+    call(script, *words)
+    found = tables.read_episodes(tmp_path / "c" / "episodes.csv")
+    assert np.mean(found["focused"]["success"]) > 0.4

@@ -1,0 +1,364 @@
+"""Sweeps: a run as one function, grids and groups, engines, resume, failures."""
+
+import csv
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+import envs
+from experiments.cli import Axes, Sweep
+from experiments.engine.run import RunSettings, algorithm_factory, make_env_and_expert, train
+from experiments.engine.runtime import UserError
+from experiments.engine.worker import Worker
+from experiments.studies import grid
+from experiments.studies.runner import plan
+from ppl_jax import sweep as pure
+from ppl_jax.training import make_train
+from tests.helpers import Probe
+from tests.system.test_compare import ROOT, program
+from tests.unit.test_algorithms import probe_settings
+
+if "probe" not in envs.registered():
+    envs.register("probe", Probe)
+
+TINY = ["--total-steps", "60", "--evaluate-every", "20", "--batch-size", "8"]
+
+
+def rows_of(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def settings_of(name, seed=0, **changes):
+    changes = {"total_steps": 60, "batch_size": 8, "human_capacity": 60} | changes
+    config, hparams = probe_settings(name, **changes)
+    return RunSettings("probe", name, seed, config, hparams, evaluate_every=20)
+
+
+def lane_of(settings):
+    env, expert = make_env_and_expert(settings)
+    functions = make_train(env, expert, algorithm_factory(settings, env), settings.config)
+    return env, pure.make_run(env, functions, settings.config, settings.evaluate_every)
+
+
+# --- a run as one function ---
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("ppl", {}),
+        ("bc", {"total_steps": 20, "demonstrations": 20, "offline_updates": 20}),
+        ("thrifty_dagger", {"demonstrations": 20, "offline_updates": 20}),
+        ("pvp", {"total_steps": 50}),  # the last evaluation comes early
+    ],
+)
+def test_a_lane_is_the_run_that_ppl_train_makes(name, changes, tmp_path):
+    settings = settings_of(name, 3, **changes)
+    summary = train(settings, tmp_path / "run")
+    env, lane = lane_of(settings)
+    curve = jax.jit(lane)(jax.random.key(3), settings.hparams, env.held_out_params)
+    theirs = rows_of(tmp_path / "run" / "evaluation.csv")
+    steps = pure.evaluation_steps(settings.config, settings.evaluate_every)
+    assert sorted({int(row["step"]) for row in theirs}) == steps
+    for at, step in enumerate(steps):
+        mine = [row for row in theirs if int(row["step"]) == step]
+        assert [bool(int(row["success"])) for row in mine] == curve.episodes.success[at].tolist()
+        costs = [float(row["episodic_cost"]) for row in mine]
+        np.testing.assert_allclose(curve.episodes.episodic_cost[at], costs, atol=1e-4)
+        assert int(curve.counters.human_data[at]) == int(mine[0]["human_data_usage"])
+    assert int(curve.counters.human_data[-1]) == summary["human_data_usage"]
+
+
+def test_a_batch_is_its_runs_one_by_one():
+    settings = settings_of("ppl")
+    env, lane = lane_of(settings)
+    hparams = [
+        settings.hparams.replace(preference_horizon=horizon, beta=beta)
+        for horizon, beta in ((1, 0.1), (4, 0.1), (4, 0.5))
+    ]
+    keys = jax.vmap(jax.random.key)(np.arange(3, dtype=np.uint32))
+    alone = jax.jit(lane)
+    for side_by_side in (False, True):
+        batch = jax.jit(pure.make_batch(lane, side_by_side))
+        found = batch(keys, pure.stack(hparams), env.held_out_params)
+        for i in range(3):
+            own = alone(jax.random.key(i), hparams[i], env.held_out_params)
+            mine = jax.tree.map(lambda leaf, i=i: leaf[i], found)
+            assert own.counters.human_data.tolist() == mine.counters.human_data.tolist()
+            np.testing.assert_allclose(
+                own.episodes.episodic_return, mine.episodes.episodic_return, atol=1e-3
+            )
+
+
+SHARED = """
+import jax, numpy as np
+from ppl_jax import sweep
+from tests.system.test_sweep import lane_of, settings_of
+
+assert len(jax.devices()) == 2
+settings = settings_of("ppl")
+env, lane = lane_of(settings)
+keys = jax.vmap(jax.random.key)(np.arange(4, dtype=np.uint32))
+batch = jax.jit(sweep.make_batch(lane, True))
+many = sweep.stack([settings.hparams] * 4)
+apart = batch(*sweep.split((keys, many), jax.devices()), env.held_out_params)
+assert len(apart.diverged.sharding.device_set) == 2
+together = batch(keys, many, env.held_out_params)
+print((np.asarray(apart.counters.human_data) == together.counters.human_data).all())
+"""
+
+
+def test_a_batch_is_shared_out_over_devices(tmp_path):
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    found = subprocess.run(
+        [sys.executable, "-c", SHARED],
+        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert found.stdout.strip() == "True", found.stderr
+
+
+# --- grids ---
+
+
+def command(*worlds, **changes):
+    names = {field.name for field in dataclasses.fields(Axes)}
+    axes = Axes(**{name: values for name, values in changes.items() if name in names})
+    rest = {name: value for name, value in changes.items() if name not in names}
+    return Sweep(worlds, axes=axes, **rest)
+
+
+def test_what_is_traced_shares_a_program_and_what_is_static_does_not():
+    traced = {
+        "preference_horizon": (1, 4, 10),
+        "beta": (0.1, 0.3),
+        "prediction_noise": (0.0, 1.0),
+        "expert_noise": (0.0, 0.1),
+        "learning_rate": (1e-3, 1e-4),
+        "min_speed": (3.0, 5.0),
+    }
+    for name, values in traced.items():
+        runs = plan(command("driving", seeds=3, **{name: values}))
+        assert len(runs) == 3 * len(values)
+        assert len(grid.groups(runs)) == 1, name
+    runs = plan(command("driving", seeds=2, batch_size=(64, 256), beta=(0.1, 0.3)))
+    assert [len(group.runs) for group in grid.groups(runs)] == [4, 4]
+    runs = plan(command("driving", "table_wiping", algorithms=("ppl", "pvp"), seeds=1))
+    assert len(grid.groups(runs)) == 4
+
+
+def test_a_new_value_compiles_nothing():
+    """Counted where it matters: in the worker, by what it keeps and by what JAX compiles."""
+    worker, compiled = Worker(), []
+    base = settings_of("ppl")
+    for horizon, beta, noise, rate, seed in (
+        (1, 0.1, 0.0, 1e-3, 0),
+        (4, 0.1, 0.0, 1e-3, 0),
+        (4, 0.5, 0.25, 1e-4, 7),
+    ):
+        hparams = base.hparams.replace(
+            preference_horizon=horizon, beta=beta, prediction_noise=noise, learning_rate=rate
+        )
+        run = {"index": 0, "seed": seed}
+        run["hparams"] = dataclasses.replace(base, hparams=hparams).as_json()["hparams"]
+        job = {"settings": base.as_json(), "side_by_side": False, "runs": [run]}
+        reply = worker.run(json.loads(json.dumps(job)))
+        assert "error" not in reply, reply
+        compiled.append(reply["compile_s"])
+    assert len(worker.programs) == 1
+    assert compiled[0] > 0
+    assert compiled[1:] == [0, 0]
+
+
+def test_studies_are_the_papers():
+    runs = plan(command("driving", study="horizon"))
+    assert {run.settings.config.total_steps for run in runs} == {15_000}
+    assert 10_000 in pure.evaluation_steps(runs[0].settings.config, runs[0].settings.evaluate_every)
+    assert {run.settings.config.prediction_horizon for run in runs} == {10}
+    runs = plan(command("driving", study="prediction_noise", seeds=1))
+    noises = sorted({run.settings.hparams.prediction_noise for run in runs})
+    assert noises == [0, 0.0625, 0.125, 0.25, 0.5, 1]
+    assert {run.settings.algorithm for run in runs} == {"ppl", "pvp"}
+    runs = plan(command("table_wiping", study="horizon_beta", beta=(0.1,), seeds=1))
+    assert {run.settings.hparams.beta for run in runs} == {0.1}  # what is given replaces
+    assert len(grid.groups(runs)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"beta": (-1.0,)}, "beta must not be negative, got -1"),
+        ({"preference_horizon": (4, 99)}, r"preference_horizon must not exceed.*99"),
+        ({"beta": (0.1, 0.1)}, "beta: every value once, got 0.1, 0.1"),
+        ({"algorithms": ("nothing",)}, "nothing"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_built(changes, said):
+    with pytest.raises(UserError, match=said):
+        plan(command("driving", **changes))
+
+
+# --- the command ---
+
+
+def sweep(tmp_path, out, *words, code=0):
+    return program(tmp_path, "sweep", "probe", *words, *TINY, "--out", tmp_path / out, code=code)
+
+
+def test_a_sweep_that_is_killed_goes_on_to_the_same_results(tmp_path):
+    words = ["--preference-horizon", "1", "4", "--beta", "0.1", "0.3", "--seeds", "3"]
+    told = sweep(tmp_path, "whole", *words)
+    assert "12 runs, 0 of them done" in told.stderr
+    assert "in 1 groups: 1 programs to compile" in told.stderr
+    whole = {name: (tmp_path / "whole" / name).read_bytes() for name in FILES}
+    rows = rows_of(tmp_path / "whole" / "results.csv")
+    assert len(rows) == 12 * 3
+    assert {row["status"] for row in rows} == {"done"}
+    assert len(rows_of(tmp_path / "whole" / "episodes.csv")) == 12 * 2
+
+    out = tmp_path / "killed"
+    script = tmp_path / "own.py"
+    call = [sys.executable, str(script), "sweep", "probe", *words, *TINY, "--out", str(out)]
+    process = subprocess.Popen(
+        call,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.time() + 200
+    while len(done := lines_of(out / "results.csv")) < 4 and time.time() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert len(done) >= 4
+    with open(out / "results.csv", "a") as file:  # as if killed within a line
+        file.write("probe/ppl/preference_horizon=4,be")
+    before = {row["run"] for row in rows_of(out / "results.csv")[:-1]}
+    told = sweep(tmp_path, "killed", *words)
+    finished = {line.split()[2] for line in told.stderr.splitlines() if line.startswith("runs ")}
+    assert "0 of them done" not in told.stderr
+    assert not finished & {run for run in before if whole_run(out, run, rows)}
+    assert {name: (out / name).read_bytes() for name in FILES} == whole
+
+    told = sweep(tmp_path, "killed", *words)  # and once more: nothing to do, nothing changed
+    assert "12 of them done" in told.stderr
+    assert {name: (out / name).read_bytes() for name in FILES} == whole
+    told = sweep(tmp_path, "killed", *words, "--learning-rate", "0.5", code=2)
+    assert "give another --out" in told.stderr
+
+
+FILES = ("results.csv", "episodes.csv")
+
+
+def lines_of(path):
+    return path.read_text().splitlines() if path.is_file() else []
+
+
+def whole_run(out, run, rows):
+    return sum(row["run"] == run for row in rows) == 3
+
+
+def test_a_dry_run_says_how_much_it_is_and_writes_nothing(tmp_path):
+    told = sweep(
+        tmp_path, "none", "--beta", "0.1", "0.3", "--prediction-horizon", "10", "20", "--dry-run"
+    )
+    assert "20 runs, 0 of them done" in told.stderr
+    assert "in 2 groups: 2 programs to compile" in told.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_fails_or_diverges_is_a_row_and_the_rest_goes_on(tmp_path):
+    words = ["--algorithms", "broken", "ppl", "--learning-rate", "0.001", "1e30", "--seeds", "1"]
+    told = sweep(tmp_path, "some", *words, code=2)
+    assert "2 of 4 runs failed" in told.stderr
+    assert "this method is broken" in told.stderr
+    rows = rows_of(tmp_path / "some" / "results.csv")
+    status = {row["run"]: row["status"] for row in rows}
+    assert [s.split(":")[0] for s in status.values()] == ["failed", "failed", "done", "diverged"]
+    told = sweep(tmp_path, "some", *words, code=2)
+    assert "2 of them done" in told.stderr  # what failed is tried again, what diverged is not
+    assert rows_of(tmp_path / "some" / "results.csv") == rows
+
+
+DYING = """
+import os, pathlib
+import envs
+from experiments import cli
+from experiments.engine import worker
+
+really = worker.Worker.run
+flag = pathlib.Path(__file__).with_suffix(".died")
+
+def run(self, job):
+    if not flag.exists() and job["runs"][0]["seed"] == 1:
+        flag.touch()
+        os._exit(9)
+    return really(self, job)
+
+worker.Worker.run = run
+from tests.helpers import Probe
+envs.register("probe", Probe)
+if __name__ == "__main__":
+    cli.main()
+"""
+
+
+def test_a_worker_that_dies_loses_and_doubles_nothing(tmp_path):
+    script = tmp_path / "dying.py"
+    script.write_text(DYING)
+    words = ["sweep", "probe", "--seeds", "4", *TINY, "--out", str(tmp_path / "d")]
+    done = subprocess.run(
+        [sys.executable, str(script), *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert script.with_suffix(".died").exists()
+    seeds = [row["seed"] for row in rows_of(tmp_path / "d" / "results.csv")]
+    assert seeds == [str(seed) for seed in range(4) for _ in range(3)]
+
+
+# Ray forks to start its nodes and replaces the child at once; JAX, by then running, warns of forks
+@pytest.mark.filterwarnings("ignore:os.fork")
+def test_a_ray_cluster_that_loses_a_node_loses_and_doubles_nothing(tmp_path):
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    words = ["--preference-horizon", "1", "4", "--seeds", "6"]
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        node = cluster.add_node(num_cpus=1)
+        cluster.wait_for_nodes()
+        out, script = tmp_path / "ray", tmp_path / "own.py"
+        sweep(tmp_path, "local", *words)
+        ray = ["--engine", "ray", "--address", cluster.address]
+        call = [sys.executable, str(script), "sweep", "probe", *words, *TINY, *ray, "--out", out]
+        process = subprocess.Popen(
+            list(map(str, call)),
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        deadline = time.time() + 200
+        while len(lines_of(out / "results.csv")) < 4 and time.time() < deadline:
+            time.sleep(0.02)
+        cluster.remove_node(node, allow_graceful=False)
+        _, told = process.communicate(timeout=300)
+        assert process.returncode == 0, told
+    finally:
+        cluster.shutdown()
+    for name in FILES:
+        assert (out / name).read_bytes() == (tmp_path / "local" / name).read_bytes()

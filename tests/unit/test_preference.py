@@ -1,0 +1,127 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ppl_jax.config import HParams
+from ppl_jax.gates import deviates_from_expert, low_return, unsafe_or_slow
+from ppl_jax.preference import preference_pairs
+from ppl_jax.types import Interaction, Trajectory
+
+M, O, A = 6, 4, 2
+SCALE = np.array([1.0, 1.0, 2.0, 1.0], np.float32)
+
+
+def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=()):
+    def at(steps):
+        return jnp.isin(jnp.arange(M), jnp.array(list(steps), int))
+
+    steps = jnp.arange(M) < valid
+    return Trajectory(
+        observation=jnp.arange(M * O, dtype=jnp.float32).reshape(M, O),
+        reward=jnp.where(steps, reward, 0.0),
+        speed=jnp.where(steps, speed, 0.0),
+        unsafe=at(unsafe),
+        success=at(success),
+        terminated=at(ended),
+        valid=steps,
+    )
+
+
+def interaction(takeover, predicted):
+    flag = jnp.asarray(takeover)
+    zero = jnp.zeros(())
+    return Interaction(
+        observation=jnp.full(O, -1.0),
+        next_observation=jnp.zeros(O),
+        novice_action=jnp.full(A, 0.25),
+        expert_action=jnp.full(A, 0.75),
+        executed_action=jnp.zeros(A),
+        takeover=flag,
+        takeover_start=flag,
+        reward=zero,
+        cost=zero,
+        terminated=flag,
+        truncated=flag,
+        success=flag,
+        predicted=predicted,
+    )
+
+
+@pytest.mark.parametrize("takeover", [False, True])
+@pytest.mark.parametrize("horizon", [1, 3, M])
+@pytest.mark.parametrize("valid", [1, 4, M])
+@pytest.mark.parametrize("pair_states", ["predicted", "shifted"])
+def test_pairs_are_the_loop_of_algorithm_1(takeover, horizon, valid, pair_states):
+    step = interaction(takeover, trajectory(valid))
+    pairs, mask = preference_pairs(step, jnp.float32(horizon), pair_states)
+    expected = []
+    states = [np.full(O, -1.0), *np.asarray(step.predicted.observation)]
+    for i in range(1, M + 1):
+        if takeover and i <= horizon and i <= valid:
+            if pair_states == "predicted":
+                expected.append((states[i], None))
+            else:
+                expected.append((states[i - 1], states[i]))
+    got = np.flatnonzero(np.asarray(mask))
+    assert len(got) == len(expected)
+    for row, (state, rejected) in zip(got, expected, strict=True):
+        np.testing.assert_array_equal(pairs.observation[row], state)
+        np.testing.assert_array_equal(pairs.preferred_action[row], np.full(A, 0.75))
+        np.testing.assert_array_equal(pairs.rejected_action[row], np.full(A, 0.25))
+        if rejected is not None:
+            np.testing.assert_array_equal(pairs.rejected_observation[row], rejected)
+
+
+def test_changing_the_horizon_compiles_nothing():
+    step = interaction(True, trajectory())
+    run = jax.jit(preference_pairs, static_argnums=2)
+    for horizon in (1.0, 2.0, 5.0):
+        assert int(run(step, jnp.float32(horizon), "predicted")[1].sum()) == horizon
+    assert run._cache_size() == 1
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ({}, False),
+        ({"unsafe": [4]}, True),
+        ({"speed": 4.0}, True),
+        ({"speed": 4.0, "success": [2], "valid": 3}, False),
+        ({"valid": 2, "speed": 6.0}, False),
+    ],
+)
+def test_the_driving_gate(case, expected):
+    assert bool(unsafe_or_slow(trajectory(**case), None, HParams(min_speed=5.0), SCALE)) is expected
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ({"reward": 2.0}, False),
+        ({"reward": 1.6}, True),
+        ({"reward": 20.0, "valid": 1, "ended": [0]}, False),
+        ({"reward": -1.0, "valid": 1, "ended": [0]}, True),
+    ],
+)
+def test_the_released_gate(case, expected):
+    assert bool(low_return(trajectory(**case), None, HParams(min_return=10.0), SCALE)) is expected
+
+
+@pytest.mark.parametrize(
+    ("case", "shift", "expected"),
+    [
+        ({}, [0.9, 0.0, 1.9, 0.0], False),
+        ({}, [0.0, 0.0, 2.1, 0.0], True),
+        ({"success": [3]}, [0.0, 0.0, 2.1, 0.0], False),
+        ({"unsafe": [4]}, [0.0, 0.0, 0.0, 0.0], True),
+    ],
+)
+def test_the_gate_that_compares_with_the_expert(case, shift, expected):
+    novice = trajectory(**case)
+    experts = trajectory()
+    experts = experts.replace(observation=experts.observation.at[-1].add(jnp.array(shift)))
+    hparams = HParams(max_departure=1.0)
+    assert bool(deviates_from_expert(novice, experts, hparams, SCALE)) is expected
+    with pytest.raises(ValueError, match="expert's own prediction"):
+        deviates_from_expert(novice, None, hparams, SCALE)

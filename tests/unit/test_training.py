@@ -1,0 +1,262 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ppl_jax import algorithms, experts
+from ppl_jax.algorithms.ppl import make_ppl
+from ppl_jax.config import HParams, TrainConfig, reference, validate
+from ppl_jax.evaluation import make_evaluate
+from ppl_jax.training import make_train
+from tests.helpers import Probe
+
+TINY = TrainConfig(
+    total_steps=600,
+    batch_size=32,
+    hidden=(32,),
+    prediction_horizon=6,
+    decision_interval=5,
+    max_preference_horizon=6,
+    human_capacity=600,
+    preference_capacity=2000,
+)
+HP = HParams(learning_rate=3e-3)
+
+
+def functions(dependent=True, algorithm="ppl", **changes):
+    probe = Probe(dependent)
+    config = dataclasses.replace(TINY, **changes)
+    return probe, make_train(
+        probe, probe.scripted_expert, algorithms.method(algorithm).make, config
+    )
+
+
+def success(probe, fns, learner):
+    layers, spec = fns.algorithm.policy(learner.algorithm), probe.spec
+    policy = experts.SavedPolicy(
+        layers, "relu", "tanh", spec.observation_mean, spec.observation_scale
+    )
+    run = make_evaluate(probe, lambda k, s, o, p: experts.act(policy, o))
+    return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
+
+
+@pytest.mark.parametrize("algorithm", ["ppl", "hg_dagger"])
+@pytest.mark.parametrize("dependent", [False, True])
+def test_probe_worlds_are_solved(algorithm, dependent):
+    probe, fns = functions(dependent, algorithm)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP)
+    assert success(probe, fns, learner) == 1.0
+    for sign in probe.default_params.signs:
+        action = fns.algorithm.act(learner.algorithm, None, jnp.array([sign, 0.0, 1.0]))
+        assert float(action[0]) == pytest.approx(float(probe.answer(sign)), abs=probe.tolerance)
+    assert int(learner.counters.human_data) < 400  # the expert is needed less and less
+
+
+def test_a_gate_by_action_probability():
+    """The expert takes over where its density of the novice's action is low, and nowhere else."""
+    probe, weight = Probe(), np.zeros((3, 1), np.float32)
+    weight[0] = np.arctanh(0.6)
+    policy = experts.SavedPolicy(
+        [(weight, np.zeros(1))], "relu", "tanh", np.zeros(3), np.ones(3), np.log([0.2])
+    )
+    expert = experts.neural_expert(policy)
+    np.testing.assert_allclose(expert(None, None, jnp.array([-1.0, 0.3, 1.0]), None), [-0.6])
+    config = dataclasses.replace(TINY, gate="action_probability")
+    fns = make_train(probe, expert, make_ppl, config)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP.replace(min_log_density=-1.0))
+    assert success(probe, fns, learner) == 1.0
+    assert 0 < int(learner.counters.human_data) < 400
+    run = jax.jit(lambda learner: fns.run_chunk(learner, 1))
+    for wrong, takes_over in ((0.6, False), (0.55, False), (-0.6, True), (0.0, True)):
+        # at -1: a distance of 0.44 or more is that unlikely
+        start = fns.init(jax.random.key(1), HP.replace(min_log_density=-1.0, learning_rate=0.0))
+        bias = jnp.arctanh(wrong * start.env_state.sign)
+        start = jax.tree.map(jnp.zeros_like, start.algorithm.learned.params), start
+        params = {**start[0]}
+        last = params["params"]["Dense_1"]
+        last["bias"] = last["bias"] + bias
+        learned = dataclasses.replace(start[1].algorithm.learned, params=params)
+        algorithm = dataclasses.replace(start[1].algorithm, learned=learned)
+        after, _ = run(dataclasses.replace(start[1], algorithm=algorithm))
+        assert (int(after.counters.human_data) > 0) == takes_over
+    with pytest.raises(
+        ValueError, match="gate 'action_probability' needs an expert with a density"
+    ):
+        make_train(probe, probe.scripted_expert, make_ppl, config)
+
+
+def test_the_released_settings_run_and_solve_the_probe():
+    probe = Probe()
+    config, hparams = reference()
+    config = dataclasses.replace(
+        config,
+        total_steps=600,
+        batch_size=32,
+        hidden=(32,),
+        predictor="simulator",
+    )
+    fns = make_train(probe, probe.scripted_expert, make_ppl, config)
+    hparams = hparams.replace(learning_rate=3e-3, min_return=-3.0)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
+    assert success(probe, fns, learner) == 1.0
+
+
+def test_without_an_expert_in_reach_nothing_is_learnt():
+    # a gate that never fires: no data, no update
+    probe, fns = functions()
+    algorithm = fns.algorithm._replace(decide=lambda state, point, hparams: jnp.zeros((), bool))
+    fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
+    start = fns.init(jax.random.key(0), HP)
+    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
+    assert int(learner.counters.human_data) == 0
+    for a, b in zip(
+        jax.tree.leaves(start.algorithm.learned),
+        jax.tree.leaves(learner.algorithm.learned),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_vmapped_batch_is_the_runs_one_by_one():
+    _, fns = functions(total_steps=100)
+    seeds = jnp.arange(4)
+    grid = HParams(
+        preference_horizon=jnp.array([1.0, 3.0, 6.0, 4.0]),
+        beta=jnp.array([0.1, 0.3, 1.0, 0.0]),
+        prediction_noise=jnp.array([0.0, 0.1, 0.2, 0.0]),
+        expert_noise=jnp.array([0.0, 0.0, 0.1, 0.2]),
+        learning_rate=jnp.full(4, 1e-3),
+    )
+    axes = HParams(
+        **{f.name: 0 if jnp.ndim(getattr(grid, f.name)) else None for f in dataclasses.fields(grid)}
+    )
+    keys = jax.vmap(jax.random.key)(seeds)
+    together, metrics = jax.jit(jax.vmap(fns.train, in_axes=(0, axes)))(keys, grid)
+    train = jax.jit(fns.train)
+    for i in range(4):
+        one = HParams(
+            **{
+                f.name: value[i] if jnp.ndim(value := getattr(grid, f.name)) else value
+                for f in dataclasses.fields(grid)
+            }
+        )
+        alone, alone_metrics = train(keys[i], jax.tree.map(jnp.float32, one))
+        assert int(alone.counters.human_data) == int(together.counters.human_data[i])
+        for a, b in zip(
+            jax.tree.leaves(alone.algorithm.learned),
+            jax.tree.leaves(jax.tree.map(lambda x, i=i: x[i], together.algorithm.learned)),
+            strict=True,
+        ):
+            np.testing.assert_allclose(a, b, atol=2e-4)
+        np.testing.assert_allclose(
+            alone_metrics["train/loss_bc"], metrics["train/loss_bc"][i], rtol=2e-2, atol=1e-4
+        )
+    assert train._cache_size() == 1  # another L, beta, noise or seed compiles nothing
+
+
+def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
+    """Counts calls of the transition under vmap: a batched cond would run it in every lane."""
+    calls = []
+
+    class Counting(Probe):
+        def transition(self, key, state, action, params):
+            jax.debug.callback(lambda *_: calls.append(1), state.time)
+            return super().transition(key, state, action, params)
+
+    probe = Counting()
+    config = dataclasses.replace(TINY, total_steps=5)
+    gate = make_train(probe, probe.scripted_expert, make_ppl, config).algorithm
+    # the expert takes over in the lanes whose observation shows +1
+    gate = gate._replace(
+        decide=lambda state, point, hparams: point.trajectory.observation[0, 0] > 0,
+        needs_expert_rollout=True,
+    )
+    fns = make_train(probe, probe.scripted_expert, lambda spec, config: gate, config)
+    keys = jax.random.split(jax.random.key(0), 8)
+    learners, _ = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))(keys, HP)
+    jax.effects_barrier()
+    taken = int(jnp.sum(learners.counters.human_data))
+    assert 0 < taken < 8 * 5
+    # two lookaheads of the gate in each lane, every step, and what the experts' steps look ahead
+    assert len(calls) == 8 * (2 * 6 + 5) + 6 * taken
+
+
+def test_chunks_are_the_whole_run_bit_for_bit():
+    _, fns = functions(total_steps=60)
+    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    start = jax.jit(fns.init)(jax.random.key(3), HP)
+    halves = start
+    for _ in range(4):
+        halves, _ = chunk(halves, 3)
+    whole, _ = chunk(start, 12)
+    for a, b in zip(jax.tree.leaves(halves), jax.tree.leaves(whole), strict=True):
+        if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_buffers_hold_what_algorithm_1_says():
+    """Replay the run step by step in Python and compare the data sets."""
+    probe, fns = functions(total_steps=100)
+    hparams = HP.replace(preference_horizon=2)
+    learner = jax.jit(fns.init)(jax.random.key(0), hparams)
+    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    learner, _ = chunk(learner, 20)
+    human, pairs = learner.algorithm.human_buffer, learner.algorithm.preference_buffer
+    count = int(human.added)
+    assert count == int(learner.counters.human_data) > 0
+    observations, actions = (np.asarray(x)[:count] for x in human.data)
+    np.testing.assert_allclose(actions[:, 0], 0.6 * observations[:, 0], atol=1e-6)
+    held = int(pairs.added)
+    assert count <= held <= 2 * count
+    np.testing.assert_allclose(
+        np.asarray(pairs.data.preferred_action)[:held, 0],
+        0.6 * np.asarray(pairs.data.observation)[:held, 0],
+        atol=1e-6,
+    )
+    # each taken-over step's first predicted error is the present one plus the novice's miss
+    novice = np.asarray(pairs.data.rejected_action)[:held, 0]
+    miss = np.abs(novice - np.asarray(pairs.data.preferred_action)[:held, 0])
+    error = np.asarray(pairs.data.observation)[:held, 1]
+    assert (error[miss > probe.tolerance] >= miss[miss > probe.tolerance] - 1e-5).all()
+
+
+def test_a_diverged_run_is_flagged_and_frozen():
+    _, fns = functions(total_steps=100)
+    learner = jax.jit(fns.init)(jax.random.key(0), HP)
+    broken = jax.tree.map(lambda x: x.at[...].set(jnp.nan), learner.algorithm.learned.params)
+    learned = learner.algorithm.learned.replace(params=broken)
+    learner = learner.replace(algorithm=learner.algorithm.replace(learned=learned))
+    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(learner, 2)
+    assert bool(learner.diverged)
+    assert int(learner.counters.steps) == 10
+
+
+@pytest.mark.parametrize(
+    ("config", "hparams", "message"),
+    [
+        ({"total_steps": 0}, {}, "total_steps must be at least 1, got 0"),
+        ({"total_steps": 7}, {}, "total_steps must be a multiple of decision_interval"),
+        ({"demonstrations": 7}, {}, "demonstrations must be a multiple of decision_interval"),
+        (
+            {"demonstrations": 605},
+            {},
+            "demonstrations must not exceed total_steps",
+        ),
+        ({"offline_updates": 10}, {}, "offline_updates needs demonstrations to learn from, got 10"),
+        ({}, {"discount": 1.5}, "discount must lie between 0 and 1, got 1.5"),
+        ({}, {"margin": -1.0}, "margin must not be negative, got -1"),
+        ({"members": 0}, {}, "members must be at least 1, got 0"),
+        ({}, {"preference_horizon": 0}, "preference_horizon must be at least 1, got 0"),
+        ({}, {"preference_horizon": 7}, "preference_horizon must not exceed prediction_horizon"),
+        ({}, {"beta": -0.1}, "beta must not be negative"),
+        ({}, {"beta": float("nan")}, "beta must not be negative, got nan"),
+        ({}, {"prediction_noise": -1.0}, "prediction_noise must not be negative"),
+        ({"hidden": ()}, {}, "hidden must name at least one width"),
+    ],
+)
+def test_bad_settings_are_one_clear_line(config, hparams, message):
+    with pytest.raises(ValueError, match=message) as error:
+        validate(dataclasses.replace(TINY, **config), HP.replace(**hparams))
+    assert "\n" not in str(error.value)
