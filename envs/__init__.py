@@ -1,5 +1,5 @@
 """The worlds: `make(name)` builds one, `register` adds one's own."""
 
-from envs.registry import known, make, register, registered, unknown
+from envs.registry import card, known, make, register, registered, unknown
 
-__all__ = ["known", "make", "register", "registered", "unknown"]
+__all__ = ["card", "known", "make", "register", "registered", "unknown"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -34,6 +35,11 @@ class Environment:
     def observe(self, state: Any, params: Any) -> jax.Array:
         """The observation, [O]."""
         raise NotImplementedError(f"{type(self).__name__}.observe")
+
+    @property
+    def predictors(self) -> Mapping[str, Any]:
+        """Transitions that predictions may use, by name; "simulator" is the environment's own."""
+        return {"simulator": self.transition}
 
     def scenario_count(self, params: Any) -> int:
         """Number of scenarios in `params`."""

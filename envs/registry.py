@@ -5,16 +5,38 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from envs import cards
+from ppl_jax.cards import EnvCard
+
 BRAX = "brax:"
 
 _MAKERS: dict[str, Callable[..., Any]] = {}
+_CARDS: dict[str, EnvCard] = {}
 
 
-def register(name: str, maker: Callable[..., Any]) -> None:
-    """Make `make(name)` call `maker`; a name taken already is an error."""
+def register(name: str, maker: Callable[..., Any], card: EnvCard | None = None) -> None:
+    """Make `make(name)` call `maker`; a name taken already is an error.
+
+    Args:
+        name: As the user types it.
+        maker: `maker(**options) -> Environment`.
+        card: What the environment says of itself; the defaults of `EnvCard` where None.
+    """
     if name in _MAKERS:
         raise ValueError(f"environment {name!r} is registered already")
     _MAKERS[name] = maker
+    _CARDS[name] = card or EnvCard(name)
+
+
+def card(name: str) -> EnvCard:
+    """What an environment says of itself; it is not built for that.
+
+    Raises:
+        ValueError: If no environment has that name.
+    """
+    if not known(name):
+        raise ValueError(unknown(name))
+    return _CARDS.get(name, EnvCard(name))
 
 
 def registered() -> tuple[str, ...]:
@@ -65,6 +87,6 @@ def _nut_assembly(**options: Any) -> Any:
     return make_nut_assembly(**options)
 
 
-register("driving", _driving)
-register("nut_assembly", _nut_assembly)
-register("table_wiping", _table_wiping)
+register("driving", _driving, cards.DRIVING)
+register("nut_assembly", _nut_assembly, cards.NUT_ASSEMBLY)
+register("table_wiping", _table_wiping, cards.TABLE_WIPING)

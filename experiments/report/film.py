@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import card
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import make_world, named_expert, run_options
 from experiments.engine.runtime import UserError
-from ppl_jax.config import default
-from ppl_jax.gates import RULES
+from ppl_jax import algorithms
+from ppl_jax.gates import gate
 from ppl_jax.predictors import predict
-from ppl_jax.types import Env, Expert
+from ppl_jax.types import DecisionPoint, Env, Expert
 
 SUFFIXES = (".gif", ".mp4", ".png")
 
@@ -59,8 +60,8 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
-    config, hparams = default(env.name)
-    rule, key = RULES[config.gate], jax.random.key(0)
+    config, hparams = algorithms.settings("ppl", card(env.name))
+    rule, key = gate(config.gate), jax.random.key(0)
     state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
     if env.name == "driving":
         place, picture = _driving(env, state)
@@ -76,7 +77,16 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
         novice = ahead(state, action, params, horizon)
         expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
         after, outcome = env.transition(key, state, action, params)
-        takeover = rule(novice, None, hparams, env.spec.observation_scale)
+        point = DecisionPoint(
+            observation=env.observe(state, params),
+            novice_action=action,
+            expert_action=action,
+            takeover=jnp.zeros((), bool),
+            trajectory=novice,
+            experts=None,
+            log_density=jnp.asarray(jnp.nan),
+        )
+        takeover = rule.decide(point, hparams.gate, env.spec.observation_scale)
         return after, outcome, novice.position, takeover, expert.position
 
     frames = []

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make
+from envs import card, make
 from envs.driving.env import make_driving
 from envs.manipulation.scenes.model import SUBSTEPS
 from experiments.engine.runtime import device, versions
@@ -203,7 +203,7 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
     GAIL's is a round of `rollout_steps` steps and its update. Five seeds are compared with five
     runs of 10,000 steps, once for the running alone and once with compiling from nothing.
     """
-    config, hparams = algorithms.settings(name, "driving")
+    config, hparams = algorithms.settings(name, card("driving"))
     # demonstrations in its buffers, and as many steps of its own
     config = dataclasses.replace(config, demonstrations=STEPS, total_steps=10_000 + STEPS)
     make, seeds = algorithms.method(name).make, 5
@@ -297,7 +297,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     A part's share is what a run costs more than the same run without that part. It is the start of
     a run that is timed, where the expert is in control most and pairs cost most.
     """
-    config, hparams = algorithms.settings("ppl", "driving")
+    config, hparams = algorithms.settings("ppl", card("driving"))
     config = dataclasses.replace(config, total_steps=STEPS)
     blocks = STEPS // config.decision_interval
 
@@ -322,7 +322,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     whole = timed(make_ppl)
     no_gradient = timed(without(update=_no_update))
     no_pairs = timed(
-        without(update=_no_update, store=lambda state, step, hparams: state, uses_predictions=False)
+        without(update=_no_update, store=lambda state, step, hparams: state, predicted_steps=0)
     )
     return {
         "train_ms_per_step": whole,
@@ -334,7 +334,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
 
 def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
     """FLOP/s of the update against a plain matrix product of its largest shape."""
-    config, hparams = algorithms.settings("ppl", "driving")
+    config, hparams = algorithms.settings("ppl", card("driving"))
     algorithm = make_ppl(env.spec, config)
     state = algorithm.init(jax.random.key(0))
     ones = jax.tree.map(jnp.ones_like, state.human_buffer.added) * config.batch_size
