@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import (
-    Frames,
     Matrix,
+    Motion,
     Vector,
     add,
     combine,
     cross,
     dot,
+    drag,
     frames,
     jacobian,
+    joint_torque,
     mass_matrix,
     scale,
+    twist_of,
 )
-from envs.manipulation.scenes.model import (
-    AIR_DENSITY,
-    AIR_VISCOSITY,
-    DAMPING,
-    FRICTION_LOSS,
-    TORQUE_LIMIT,
-    Tool,
-)
+from envs.manipulation.scenes.model import DAMPING, FRICTION_LOSS, TORQUE_LIMIT, Tool
 
 Scalar = Any
 
@@ -76,56 +72,6 @@ def any_nonzero(values: list[Scalar]) -> Scalar:
     for value in values[1:]:
         found = found | (value != 0)
     return found
-
-
-class Motion(NamedTuple):
-    """The arm at the start of a physics step.
-
-    Attributes:
-        at: Kinematics.
-        columns: Jacobian of the grip site, per joint (linear, angular).
-        twist: Velocity of the grip site, m/s and rad/s.
-        matrix: Mass matrix.
-        acceleration: Of the joints, without contact, rad/s^2.
-        speeds: Of the joints, rad/s.
-    """
-
-    at: Frames
-    columns: list[tuple[Vector, Vector]]
-    twist: tuple[Vector, Vector]
-    matrix: unrolled_linalg.Rows
-    acceleration: list[Scalar]
-    speeds: list[Scalar]
-
-
-def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple[Vector, Vector]:
-    """The product J rates."""
-    linear = angular = (0.0, 0.0, 0.0)
-    for (a, b), rate in zip(columns, rates, strict=True):
-        linear, angular = add(linear, scale(rate, a)), add(angular, scale(rate, b))
-    return linear, angular
-
-
-def joint_torque(columns: list[tuple[Vector, Vector]], force: Vector, torque: Vector):
-    """The product J' [force, torque]."""
-    return [dot(a, force) + dot(b, torque) for a, b in columns]
-
-
-def drag(tool: Tool, rotation: Matrix, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-    """Force and torque of the air on the tool (MuJoCo's inertia-box model).
-
-    The wiper's nominal inertia makes it a box of 1.4 m: at 1 rad/s the air brakes it by 0.2 N m.
-    """
-    side = tool.box
-    result = []
-    for vector, quadratic, viscous in (
-        (twist[0], 0.5 * AIR_DENSITY * side**2, 3 * jnp.pi * side * AIR_VISCOSITY),
-        (twist[1], AIR_DENSITY * side**5 / 32, jnp.pi * side**3 * AIR_VISCOSITY),
-    ):
-        local = tuple(dot(axis, vector) for axis in rotation)
-        local = tuple(-(quadratic * jnp.abs(v) + viscous) * v for v in local)
-        result.append(combine(rotation, local))
-    return result[0], result[1]
 
 
 def free_motion(
@@ -183,5 +129,10 @@ def free_motion(
         brake = DAMPING * speeds[index] + FRICTION_LOSS * jnp.tanh(speeds[index] / _SETTLING)
         net.append(applied + air[index] - brake)
     return Motion(
-        at, columns, (linear, angular), matrix, unrolled_linalg.solve(factor, net), speeds
+        at=at,
+        columns=columns,
+        twist=(linear, angular),
+        matrix=matrix,
+        acceleration=unrolled_linalg.solve(factor, net),
+        speeds=speeds,
     )

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control import gripper, operational_space
-from envs.manipulation.control.quaternion import hand_quaternion, multiply
-from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import bias_torque, frames
+from envs.manipulation.control import operational_space
+from envs.manipulation.physics.analytic import gripper, unrolled_linalg
+from envs.manipulation.physics.analytic.arm import bias_torque, frames, jacobian, twist_of
 from envs.manipulation.physics.analytic.grasp_contact import Ring, hold
+from envs.manipulation.physics.analytic.quaternion import hand_quaternion, multiply
 from envs.manipulation.scenes.model import (
     GRIPPER,
     HANDLE,
@@ -301,11 +301,7 @@ class NutAssembly(ArmWorld):
             success=success,
             unsafe=fallen,
             progress=jnp.where(success, 1.0, jnp.max(staged)),
-            speed=jnp.linalg.norm(
-                jnp.stack(
-                    operational_space.twist_of(operational_space.jacobian(at), list(new.speeds))[0]
-                )
-            ),
+            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(new.speeds))[0])),
             physics_diverged=physics_diverged,
         )
 

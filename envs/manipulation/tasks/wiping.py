@@ -10,10 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation.control import operational_space
-from envs.manipulation.control.quaternion import hand_quaternion
 from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import Frames, bias_torque, frames
+from envs.manipulation.physics.analytic.arm import (
+    Frames,
+    bias_torque,
+    frames,
+    jacobian,
+    twist_of,
+)
 from envs.manipulation.physics.analytic.collision import arm_hits
+from envs.manipulation.physics.analytic.quaternion import hand_quaternion
 from envs.manipulation.physics.analytic.wipe_contact import POINTS, press
 from envs.manipulation.scenes.model import (
     INITIAL_JOINTS,
@@ -337,11 +343,7 @@ class TableWiping(ArmWorld):
             success=success,
             unsafe=unsafe,
             progress=jnp.mean(wiped.astype(jnp.float32)),
-            speed=jnp.linalg.norm(
-                jnp.stack(
-                    operational_space.twist_of(operational_space.jacobian(at), list(speeds))[0]
-                )
-            ),
+            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(speeds))[0])),
             physics_diverged=physics_diverged,
         )
 
