@@ -1,4 +1,4 @@
-"""The worlds: `make(name)` builds one, `register` adds one's own."""
+"""The environments: `make(name)` builds one, `register` adds one of your own."""
 
 from envs.registry import known, make, register, registered, unknown
 

@@ -94,14 +94,14 @@ def add_noise(key: jax.Array, observation: jax.Array, epsilon: jax.Array | float
 
 
 def selected_transition(env: Env, predictor: str) -> Transition:
-    """The transition a `TrainConfig.predictor` names.
+    """The transition that `TrainConfig.predictor` names.
 
     Raises:
-        ValueError: If the world has no such predictor.
+        ValueError: If the environment has no such predictor.
     """
-    if predictor == "simulator":
-        return env.transition
-    transition = getattr(env, "transition_kinematic", None)
-    if predictor != "kinematic" or transition is None:
-        raise ValueError(f"environment {env.name!r} has no predictor {predictor!r}")
-    return transition
+    if predictor not in env.predictors:
+        raise ValueError(
+            f"environment {env.name!r} has no predictor {predictor!r}: choose one of "
+            f"{', '.join(env.predictors)}"
+        )
+    return env.predictors[predictor]

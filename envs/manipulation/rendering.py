@@ -14,23 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.manipulation.physics.mujoco_c import NutTwin, WipingTwin, make_twin
+from envs.manipulation.twins import NutTwin, WipingTwin, make_twin
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
-CAMERAS = {
-    "table_wiping": {
-        "lookat": (0.05, 0.0, 0.95),
-        "distance": 1.55,
-        "azimuth": 215,
-        "elevation": -38,
-    },
-    "nut_assembly": {
-        "lookat": (0.0, -0.08, 0.95),
-        "distance": 1.25,
-        "azimuth": 150,
-        "elevation": -28,
-    },
-}
 _WIDTH = 0.004  # m, of a drawn path
 
 
@@ -100,7 +86,7 @@ class ArmScene:
             self.model.vis.quality.offsamples = 0
         self.renderer = _renderer(mujoco, self.model, *size)
         self.camera = mujoco.MjvCamera()
-        for field, value in CAMERAS[env.name].items():
+        for field, value in env.card.camera.items():
             setattr(self.camera, field, value)
         self.options = mujoco.MjvOption()
         self.options.geomgroup[3] = 0  # what is only felt

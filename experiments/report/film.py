@@ -74,7 +74,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
         novice = ahead(state, action, params, horizon)
-        expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
+        expert = ahead(state, action, params, horizon, expert=env.experts["scripted"])
         after, outcome = env.transition(key, state, action, params)
         takeover = rule(novice, None, hparams, env.spec.observation_scale)
         return after, outcome, novice.position, takeover, expert.position

@@ -67,7 +67,7 @@ def arm_values(q, v, tool):
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_arm_is_c_mujocos(mujoco, name):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     twin = make_twin(world(name)).arm
     tool, model, data = (WIPER if name == "table_wiping" else GRIPPER), twin.model, twin.data
@@ -140,7 +140,7 @@ def pressed_state():
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_twin_moves_alike_in_the_air(mujoco, name):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world(name), make_twin(world(name))
     ours = theirs = start(name)
@@ -154,7 +154,7 @@ def test_twin_moves_alike_in_the_air(mujoco, name):
 
 
 def test_twin_presses_alike(mujoco):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world("table_wiping"), make_twin(world("table_wiping"))
     act = expert_action("table_wiping")
@@ -173,7 +173,7 @@ def test_twin_presses_alike(mujoco):
 @pytest.mark.parametrize("index", [0, 1, 3])
 def test_twin_grasps_alike(mujoco, index):
     """The ring is lifted in both by the same commands, and stays within 5 mm of the other's."""
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world("nut_assembly"), make_twin(world("nut_assembly"))
     act, step = expert_action("nut_assembly"), transition("nut_assembly")

@@ -1,7 +1,8 @@
-"""What both arm worlds share: a pool of starts, and where the grip site is."""
+"""What the arm tasks share: a pool of starts, experts, and where the grip site is."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -12,14 +13,15 @@ from envs.base import Environment
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import Frames, frames
 from envs.manipulation.scenes.model import TIMESTEP, Tool
+from ppl_jax.types import Expert
 
 
-class ArmWorld(Environment):
-    """Base of the arm worlds: parameters are pools of starts with a field `number`, [S].
+class ArmTask(Environment):
+    """Base of the arm tasks: parameters are pools of starts with a field `number`, [S].
 
     Attributes:
         tool: In the hand.
-        base: [3] of the arm in the world, m.
+        base: [3] of the arm in world axes, m.
         default_params, held_out_params: Starts to train on and to evaluate on.
     """
 
@@ -27,9 +29,21 @@ class ArmWorld(Environment):
     base: np.ndarray
     sequential_on_cpu = True
 
-    def __init__(self, default_params: Any, held_out_params: Any):
+    def __init__(self, default_params: Any, held_out_params: Any, experts: Mapping[str, Expert]):
+        """Hold the pools of starts and the experts.
+
+        Args:
+            default_params, held_out_params: Starts to train on and to evaluate on.
+            experts: By name; "scripted" is the usual one.
+        """
         self.default_params = default_params
         self.held_out_params = held_out_params
+        self.experts = experts
+
+    @property
+    def scripted_expert(self) -> Expert:
+        """The expert "scripted"."""
+        return self.experts["scripted"]
 
     def scenario_numbers(self, params: Any) -> jax.Array:
         """Numbers of the pool's scenarios, [S]."""

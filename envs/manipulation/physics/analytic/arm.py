@@ -1,8 +1,8 @@
 """Kinematics and dynamics of a UR5e with a rigid tool, written out for its six joints.
 
-The same quantities as MuJoCo's (`tests/worlds/test_manipulation.py` compares them with C MuJoCo and MJX),
-but in scalars: under `vmap` each scalar becomes one vector over worlds, so that nothing is left in
-small trailing axes, which XLA does not vectorise on a CPU.
+The same quantities as MuJoCo's (`tests/worlds/test_manipulation.py` compares them with C MuJoCo and
+MJX), but in scalars: under `vmap` each scalar becomes one vector over environments, so that nothing
+is left in small trailing axes, which XLA does not vectorise on a CPU.
 """
 
 from __future__ import annotations
