@@ -187,20 +187,53 @@ class NutTwin(nut.NutAssembly):
         return total, sides
 
 
-TWINS: dict[str, Callable[[Any], Any]] = {
-    "table_wiping": WipingTwin,
-    "nut_assembly": NutTwin,
-}
-"""By the environment's name. A scene from outside adds its own here to be drawn and watched."""
+class DrawnScene:
+    """A scene of one's own in C MuJoCo, to be drawn: the arm's joints and what `place` moves.
+
+    Attributes:
+        arm: MuJoCo's model and data.
+    """
+
+    def __init__(self, env: Any, xml: str, place: Callable[[Any, Any], None]):
+        """Compile the scene.
+
+        Args:
+            env: The environment; its states have `joints`, [6] rad.
+            xml: MJCF (see `scenes.model.arm_scene`).
+            place: `place(data, state)` puts the rest of a state into MuJoCo's `MjData`.
+
+        Raises:
+            ImportError: Without MuJoCo.
+        """
+        self.env, self.arm, self._place = env, MujocoArm(xml), place
+
+    def place(self, state: Any) -> None:
+        """Put MuJoCo's data into a state."""
+        self.arm.data.qpos[:6] = np.asarray(state.joints)
+        self._place(self.arm.data, state)
+
+
+_TWINS: dict[str, Callable[[Any], Any]] = {"table_wiping": WipingTwin, "nut_assembly": NutTwin}
+
+
+def register_twin(name: str, maker: Callable[[Any], Any]) -> None:
+    """Make `make_twin` of the environment `name` call `maker(env)`: a `DrawnScene`, or more.
+
+    Raises:
+        ValueError: If the name is taken.
+    """
+    if name in _TWINS:
+        raise ValueError(f"environment {name!r} has a C MuJoCo twin already")
+    _TWINS[name] = maker
 
 
 def make_twin(env: Any) -> Any:
-    """The C MuJoCo twin of a manipulation environment.
+    """The C MuJoCo twin of an arm environment.
 
     Raises:
         ValueError: For another environment.
         ImportError: Without MuJoCo.
     """
-    if env.name not in TWINS:
-        raise ValueError(f"no C MuJoCo twin of {env.name!r}: only of {', '.join(TWINS)}")
-    return TWINS[env.name](env)
+    if env.name not in _TWINS:
+        raise ValueError(f"no C MuJoCo twin of {env.name!r}: only of {', '.join(_TWINS)}")
+    return _TWINS[env.name](env)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envs.manipulation.control import operational_space
+from envs.manipulation.make import make_nut_assembly, make_table_wiping
 from envs.manipulation.physics.analytic import arm, grasp_contact, wipe_contact
 from envs.manipulation.scenes.model import GRIPPER, INITIAL_JOINTS, TIMESTEP, WIPER
 from envs.manipulation.tasks import nut, wiping
@@ -23,7 +24,7 @@ WORLDS = ("table_wiping", "nut_assembly")
 
 @functools.cache
 def world(name):
-    make = {"table_wiping": wiping.make_table_wiping, "nut_assembly": nut.make_nut_assembly}[name]
+    make = {"table_wiping": make_table_wiping, "nut_assembly": make_nut_assembly}[name]
     return make(range(8), range(1000, 1008))
 
 

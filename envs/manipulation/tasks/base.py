@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.base import Environment
 from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import Frames, frames
+from envs.manipulation.physics.analytic.arm import Frames, frames, jacobian, twist_of
 from envs.manipulation.scenes.model import TIMESTEP, Tool
 from ppl_jax.types import Expert
 
@@ -54,8 +54,18 @@ class ArmTask(Environment):
         return params.number.shape[0]
 
     def grip_position(self, state: Any) -> jax.Array:
-        """Where the grip site is, [3] m in the world."""
+        """Where the grip site is, [3] m in world axes."""
         return jnp.stack(lagged_frames(state, self.tool).position) + self.base
+
+    def grip_velocity(self, state: Any) -> jax.Array:
+        """Velocity of the grip site, [3] m/s."""
+        at = lagged_frames(state, self.tool)
+        return jnp.stack(twist_of(jacobian(at), list(state.speeds))[0])
+
+
+def site_rotation(joints: jax.Array, tool: Tool) -> jax.Array:
+    """Axes of the grip site as rows, [3, 3]: the orientation goal at the start of an episode."""
+    return unrolled_linalg.array(frames(list(joints), tool).rotation)
 
 
 def lagged_frames(state: Any, tool: Tool) -> Frames:
