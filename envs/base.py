@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -28,16 +28,21 @@ class Environment:
     held_out_params: Any
     sequential_on_cpu: bool = False
 
-    @functools.cached_property
-    def experts(self) -> Mapping[str, Expert]:
-        """Experts by name; empty where there is none."""
-        scripted = getattr(self, "scripted_expert", None)
-        return {} if scripted is None else {"scripted": scripted}
+    if TYPE_CHECKING:  # a protocol's attribute cannot be a cached property to a type checker
+        experts: Mapping[str, Expert]
+        predictors: Mapping[str, Transition]
+    else:
 
-    @functools.cached_property
-    def predictors(self) -> Mapping[str, Transition]:
-        """Steps that the predictor may roll forward, by name: "simulator" is the true one."""
-        return {"simulator": self.transition}
+        @functools.cached_property
+        def experts(self) -> Mapping[str, Expert]:
+            """Experts by name; empty where there is none."""
+            scripted = getattr(self, "scripted_expert", None)
+            return {} if scripted is None else {"scripted": scripted}
+
+        @functools.cached_property
+        def predictors(self) -> Mapping[str, Transition]:
+            """Steps that the predictor may roll forward, by name: "simulator" is the true one."""
+            return {"simulator": self.transition}
 
     @property
     def card(self) -> EnvCard:
