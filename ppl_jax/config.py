@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ppl_jax.cards import card
 from ppl_jax.fields import About, about, setting
 
 
@@ -269,7 +270,7 @@ def check_unique(*classes: type) -> None:
 PRESETS = ("default", "paper", "reference")
 
 
-def preset_values(preset: str, card: Any) -> dict[str, Any]:
+def preset_values(preset: str, env: str) -> dict[str, Any]:
     """The flat settings that a preset gives a run in an environment.
 
     `default`: what works best here: the paper's horizons, beta, gate and pairs; the released code's
@@ -281,22 +282,24 @@ def preset_values(preset: str, card: Any) -> dict[str, Any]:
 
     Args:
         preset: "default", "paper" or "reference".
-        card: `ppl_jax.types.EnvCard` of the environment.
+        env: Name of the environment.
 
     Raises:
         ValueError: If there is no such preset, or it is not for the environment.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    about_env = card(env)
+    if preset in about_env.missing_presets:
+        others = [name for name in PRESETS if name not in about_env.missing_presets]
+        raise ValueError(
+            f"preset {preset!r} is not for {env}: choose {' or '.join(others)}"
+        )
+    own = about_env.changes(preset)
     if preset == "reference":
-        if not card.reference_preset:
-            raise ValueError(
-                f"preset 'reference' is for driving alone, got {card.name}: choose default or paper"
-            )
-        return dict(_REFERENCE)
-    own = dict(card.settings)
+        return {**_REFERENCE, **own}
     if preset == "paper":
-        return own | {"likelihood": "laplace", "preference_bias": 1.0} | card.paper_settings
+        return {"likelihood": "laplace", "preference_bias": 1.0, **own}
     return own
 
 

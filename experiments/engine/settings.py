@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from envs import card, known, unknown
+from envs import known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values
@@ -178,7 +178,7 @@ def run_settings(
         raise UserError(unknown(env))
     given = dict(given or {})
     try:
-        config, _ = algorithms.settings(algorithm, card(env), preset)
+        config, _ = algorithms.settings(algorithm, env, preset)
         if expert == "recorded":
             raise UserError("expert recorded needs the session: --expert recorded PATH")
         if (path := recording_of(expert)) is not None:
@@ -188,7 +188,7 @@ def run_settings(
             given["demonstrations"] = min(config.demonstrations, max(given["total_steps"], 0))
             if not given["demonstrations"]:
                 given.setdefault("offline_updates", 0)
-        config, hparams = algorithms.settings(algorithm, card(env), preset, **given)
+        config, hparams = algorithms.settings(algorithm, env, preset, **given)
     except ValueError as error:
         raise UserError(str(error)) from error
     return RunSettings(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from envs import card, known, registered
+from envs import known, registered
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RENAMED, RENAMED_VALUES
 from ppl_jax import algorithms
@@ -65,7 +65,7 @@ def settings_in(argv: Sequence[str], preset: str = "default") -> dict[str, Setti
                 for predictor in several["predictor"]:
                     given = {"gate": gate, "predictor": predictor}
                     given = {name: value for name, value in given.items() if value is not None}
-                    made = algorithms.settings(method, card(env), preset, **given)
+                    made = algorithms.settings(method, env, preset, **given)
                     mine = catalogue(*made)
                     if not algorithms.method(method).gated:
                         mine = {k: s for k, s in mine.items() if s.about.group != "gate"}

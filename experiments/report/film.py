@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import card
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import make_world, named_expert, run_options
@@ -60,7 +59,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
-    config, hparams = algorithms.settings("ppl", card(env.name))
+    config, hparams = algorithms.settings("ppl", env.name)
     rule, key = gate(config.gate), jax.random.key(0)
     state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
     if env.name == "driving":
@@ -75,7 +74,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
         novice = ahead(state, action, params, horizon)
-        expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
+        expert = ahead(state, action, params, horizon, expert=env.experts["scripted"])
         after, outcome = env.transition(key, state, action, params)
         point = DecisionPoint(
             observation=env.observe(state, params),

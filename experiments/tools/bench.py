@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import card, make
-from envs.driving.env import make_driving
+from envs import make
+from envs.driving.make import make_driving
 from envs.manipulation.scenes.model import SUBSTEPS
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
@@ -150,7 +150,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
 
     def approach(state: Any) -> Any:
         def step(state: Any, _: None) -> Any:
-            action = env.scripted_expert(key, state, env.observe(state, params), params)
+            action = env.experts["scripted"](key, state, env.observe(state, params), params)
             return env.transition(key, state, action, params)[0], action
 
         return jax.lax.scan(step, state, None, length=CONTACT_STEPS)
@@ -171,7 +171,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
     )
     figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
     try:
-        from envs.manipulation.physics.mujoco_c import make_twin
+        from envs.manipulation.twins import make_twin
 
         twin = make_twin(env)
     except ImportError:
@@ -203,13 +203,13 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
     GAIL's is a round of `rollout_steps` steps and its update. Five seeds are compared with five
     runs of 10,000 steps, once for the running alone and once with compiling from nothing.
     """
-    config, hparams = algorithms.settings(name, card("driving"))
+    config, hparams = algorithms.settings(name, "driving")
     # demonstrations in its buffers, and as many steps of its own
     config = dataclasses.replace(config, demonstrations=STEPS, total_steps=10_000 + STEPS)
     make, seeds = algorithms.method(name).make, 5
 
     def program(make: Any, lanes: int) -> tuple[float, float]:
-        functions = make_train(env, env.scripted_expert, make, config)
+        functions = make_train(env, env.experts["scripted"], make, config)
         steps = max(functions.algorithm.update_every, STEPS)
         blocks = steps // config.decision_interval
         phase = "fit" if name == "bc" else "interact"
@@ -297,12 +297,12 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     A part's share is what a run costs more than the same run without that part. It is the start of
     a run that is timed, where the expert is in control most and pairs cost most.
     """
-    config, hparams = algorithms.settings("ppl", card("driving"))
+    config, hparams = algorithms.settings("ppl", "driving")
     config = dataclasses.replace(config, total_steps=STEPS)
     blocks = STEPS // config.decision_interval
 
     def timed(make: Any) -> float:
-        functions = make_train(env, env.scripted_expert, make, config)
+        functions = make_train(env, env.experts["scripted"], make, config)
         program = jax.jit(lambda learner: functions.run_chunk(learner, blocks), donate_argnums=0)
         # a learner with data in its buffers
         learner, _ = program(jax.jit(functions.init)(jax.random.key(0), hparams))
@@ -334,7 +334,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
 
 def _gradient(env: Any, repeats: int, train_ms: float) -> dict[str, float]:
     """FLOP/s of the update against a plain matrix product of its largest shape."""
-    config, hparams = algorithms.settings("ppl", card("driving"))
+    config, hparams = algorithms.settings("ppl", "driving")
     algorithm = make_ppl(env.spec, config)
     state = algorithm.init(jax.random.key(0))
     ones = jax.tree.map(jnp.ones_like, state.human_buffer.added) * config.batch_size

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from ppl_jax.algorithms.base import MakeAlgorithm
-from ppl_jax.cards import EnvCard
+from ppl_jax.cards import DEFAULT, EnvCard, card
 from ppl_jax.config import (
     HParams,
     NoConfig,
@@ -109,7 +109,7 @@ def register(
     known = {
         field for cls in (TrainConfig, HParams, config, hparams) for field in settings_fields(cls)
     }
-    unknown = {*function(EnvCard("")), *(tuned or {}), *(grid or {})} - known
+    unknown = {*function(DEFAULT), *(tuned or {}), *(grid or {})} - known
     if unknown:
         raise ValueError(f"algorithm {name!r} changes unknown fields: {', '.join(sorted(unknown))}")
     _METHODS[name] = AlgorithmSpec(
@@ -146,13 +146,13 @@ def method(name: str) -> AlgorithmSpec:
 
 
 def settings(
-    name: str, card: EnvCard, preset: str = "default", **given: Any
+    name: str, env: str, preset: str = "default", **given: Any
 ) -> tuple[TrainConfig, HParams]:
     """The settings of a run: the preset's for the environment, the method's own, those given.
 
     Args:
         name: Of the method.
-        card: Of the environment.
+        env: Name of the environment.
         preset: "default", "paper" or "reference".
         **given: Settings by their flat names; `gate` and `predictor` decide which further ones
             there are.
@@ -161,7 +161,7 @@ def settings(
         ValueError: If a name is unknown, or the preset is not for the environment.
     """
     spec = method(name)
-    assumed = {**preset_values(preset, card), **spec.changes(card)}
+    assumed = {**preset_values(preset, env), **spec.changes(card(env))}
     if preset == "default":
         assumed |= spec.tuned
     chosen = {"gate": TrainConfig().gate, "predictor": TrainConfig().predictor}

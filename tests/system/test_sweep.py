@@ -22,9 +22,7 @@ from experiments.studies import grid
 from experiments.studies.runner import plan
 from ppl_jax import sweep as pure
 from ppl_jax.training import make_train
-from tests.helpers import Probe
-from tests.system.test_compare import ROOT, program
-from tests.unit.test_algorithms import probe_settings
+from tests.helpers import ROOT, Probe, probe_settings, program
 
 if "probe" not in envs.registered():
     envs.register("probe", Probe)
