@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, subcommand
 
 
 @dataclasses.dataclass
@@ -254,6 +254,8 @@ class Sweep:
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
     """Folder of recorded scenarios to evaluate on."""
+    axes: Suppress[Fixed[dict[str, tuple[Any, ...]]]] = dataclasses.field(default_factory=dict)
+    """Values of the settings."""
     engine: Literal["local", "ray"] = "local"
     """Processes of this machine, or tasks of a Ray cluster."""
     address: str | None = None

@@ -154,7 +154,7 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
     for group in GROUPS:
         flat_options |= vars(getattr(parsed, group, dataclasses.make_dataclass("None_", [])()))
     given = {k: v for k, v in flat_options.items() if v != defaults[k]}
-    out, resume = flat_options["out"], flat_options["resume"]
+    out = flat_options["out"]
     before = _before(argv)
     if before is not None:
         contradicting = [

@@ -14,7 +14,9 @@ from ppl_jax.predictors import registered_predictors
 def listing() -> str:
     """Every name by kind, a line each."""
     sections = {
-        "environments": [f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()]
+        "environments": [
+            f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()
+        ]
         + ["brax:NAME        any environment of brax"],
         "methods": algorithms.registered(),
         "gates": [
