@@ -98,10 +98,10 @@ class Group:
 
 def points(axes: Values) -> list[dict[str, Any]]:
     """Every combination of the axes' values, the last axis fastest."""
-    for name, values in axes.items():
-        if len(set(values)) != len(values):
-            raise UserError(f"{name}: every value once, got {', '.join(map(str, values))}")
-    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    for name, listed in axes.items():
+        if len(set(listed)) != len(listed):
+            raise UserError(f"{name}: every value once, got {', '.join(map(str, listed))}")
+    return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
 
 def run_name(env: str, algorithm: str, values: Mapping[str, Any], seed: int) -> str:
