@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import subcommand
 
 from envs.compiler import set_xla_flags
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, hide_compiler_logs
 from experiments.engine.schedulers import SERVE
 from experiments.options.commands import (
     Ablation,
@@ -437,6 +437,7 @@ _ACTIONS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
+    hide_compiler_logs()
     words = sys.argv[1:] if argv is None else argv
     if words == [SERVE]:
         from experiments.engine.worker import serve

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs import card, known, unknown
 from experiments.engine import schedulers as engines
+from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
 from experiments.engine.runtime import UserError, revision, versions
 from experiments.engine.settings import (
@@ -201,9 +201,7 @@ def _open(out: Path, content: dict[str, Any]) -> None:
         raise UserError(f"{str(out)!r} holds something else: give another --out")
     out.mkdir(parents=True, exist_ok=True)
     about = {"versions": versions(), "revision": revision()}
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(about | content, indent=1) + "\n")
-    os.replace(temporary, path)
+    write_text_atomic(path, json.dumps(about | content, indent=1) + "\n")
 
 
 def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:
