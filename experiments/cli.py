@@ -334,8 +334,10 @@ class ExpertCard:
 
     run: Positional[Path]
     """Run folder of `ppl expert train`."""
-    out: Path = Path("envs/pretrained")
-    """Folder to write to."""
+    out: Path = Path("expert_card")
+    """Folder to write to; never the package's own `envs/pretrained`."""
+    force: bool = False
+    """Replace the files of an earlier card in --out."""
 
 
 _NO_AXES = (
@@ -805,7 +807,7 @@ def _expert(command: Expert) -> None:
     else:
         from experiments.report.card import write_card
 
-        write_card(command.command.run, command.command.out)
+        write_card(command.command.run, command.command.out, force=command.command.force)
 
 
 def _expert_train(command: ExpertTrain) -> None:
