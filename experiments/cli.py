@@ -243,7 +243,7 @@ def _expert(command: Expert) -> None:
     else:
         from experiments.report.card import write_card
 
-        write_card(command.command.run, command.command.out)
+        write_card(command.command.run, command.command.out, force=command.command.force)
 
 
 def _expert_train(command: ExpertTrain) -> None:

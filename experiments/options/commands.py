@@ -220,8 +220,10 @@ class ExpertCard:
 
     run: Positional[Path]
     """Run folder of `ppl expert train`."""
-    out: Path = Path("envs/pretrained")
-    """Folder to write to."""
+    out: Path = Path("expert_card")
+    """Folder to write to; never the package's own `envs/pretrained`."""
+    force: bool = False
+    """Replace the files of an earlier card in --out."""
 
 
 @dataclasses.dataclass
