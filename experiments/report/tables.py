@@ -110,7 +110,7 @@ def table_of(
     points: Sequence[Point], reported: Mapping[str, Reported] | None = None
 ) -> tuple[list[str], list[list[str]]]:
     """Header and rows, one per point, with a column per setting that varies."""
-    axes = list(dict.fromkeys(name for point in points for name in point.values))
+    axes = _axes(points)
     several = any(len(point.seeds) > 1 for point in points)
     trained = any("training_cost" in point.measured for point in points)
     header = ["method", *axes, "seeds", "human data", "total data", "success"]
@@ -138,6 +138,10 @@ def table_of(
     return header, rows
 
 
+def _axes(points: Sequence[Point]) -> list[str]:
+    return list(dict.fromkeys(name for point in points for name in point.values))
+
+
 def _mean(point: Point, name: str) -> str:
     return f"{point.measured[name].mean():.0f}" if name in point.measured else "-"
 
@@ -157,6 +161,7 @@ def _interquartile(point: Point) -> str:
 
 def comparison_of(points: Sequence[Point], reference: Point) -> list[list[str]]:
     """Each other point against one: paired difference of success, and P(improvement)."""
+    axes = _axes(points)
     rows = []
     for point in points:
         if point is reference:
@@ -166,7 +171,8 @@ def comparison_of(points: Sequence[Point], reference: Point) -> list[list[str]]:
         if min(len(point.seeds), len(reference.seeds)) > 1:
             scores = (one.measured["success"][None] for one in (point, reference))
             chance = show(probability_of_improvement(*scores), 2)
-        rows.append([point.label, "-" if gap is None else show(gap, 2), chance])
+        values = [point.values.get(name, "-") for name in axes]
+        rows.append([point.algorithm, *values, "-" if gap is None else show(gap, 2), chance])
     return rows
 
 
@@ -188,7 +194,8 @@ def print_points(
     labels = {point.label for point in points}
     if len(labels) == len(points) > 1:
         print()
-        header = [f"success less that of {reference.label}", "paired difference", "P(improvement)"]
+        header = ["method", *_axes(points), "paired difference", "P(improvement)"]
+        print(f"Success less that of {reference.label}:\n" if format != "latex" else "")
         write_table(header, comparison_of(points, reference), format)
     text = f"\nMeans with {describe(points)}; held-out scenarios, each once, without the expert."
     if any(len(point.seeds) > 1 for point in points):
