@@ -163,7 +163,7 @@ def named_expert(name: str, env: Env) -> Expert:
         UserError: If there is none, or the file cannot be used.
     """
     if name == "scripted":
-        expert = getattr(env, "scripted_expert", None)
+        expert = env.experts.get("scripted")
         if expert is None:
             raise UserError(f"expert: {env.name} has no scripted expert, give a policy file")
         return expert

@@ -10,7 +10,7 @@ import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from experiments.engine.runtime import UserError, need
 from experiments.report.points import (
     NOTHING,
     SEEDS,
+    Frame,
     Point,
     at_step,
     common_over,
@@ -28,9 +29,6 @@ from experiments.report.points import (
 )
 from experiments.report.tables import show
 from ppl_jax.statistics import Interval, mean_interval
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 KINDS = ("curves", "axis", "heatmap", "training", "experts", "steering", "horizon")
 SHARES = ("success", "progress")
@@ -384,7 +382,7 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
     _finish(picture, caption, out)
 
 
-def _drift_panels(panels: Any, mean: DataFrame) -> None:
+def _drift_panels(panels: Any, mean: Frame) -> None:
     """Drift, coverage and their balance over the predicted steps."""
     stops = mean["drift"].columns
     at = mean.index.to_numpy()
@@ -461,7 +459,7 @@ def _expert_row(panels: Any, path: Path) -> None:
     import pandas as pd
 
     limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
-    frame = pd.read_csv(path)
+    frame: Frame = pd.read_csv(path)
     steps = frame["step"] / 1e6
     success, cost, multiplier = panels
     for axes, column, label, dash in (

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import RENAMED, RENAMED_VALUES
+from ppl_jax.algorithms import settings as default_settings
+from ppl_jax.config import did_you_mean
+from ppl_jax.config import values as setting_values
 from ppl_jax.statistics import Interval, mean_interval, paired_difference
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
+Frame: TypeAlias = Any  # pandas.DataFrame: pandas is imported when it is used
 RESULTS, EPISODES = "results.csv", "episodes.csv"
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
 COUNTS = ("human_data_usage", "takeovers", "training_cost")
 MEASURED = (*COUNTS, *SCORES)
 _NOT_SETTINGS = {"run", "env", "algorithm", "seed", "status", "step", "total_steps", *MEASURED}
 _NOT_SETTINGS |= {"scenario", "engine", "wall_s", "compile_s"}
-_OLD_COLUMNS = {"target_rate": "polyak_tau", "max_doubt": "max_ensemble_variance"}
-_OLD_VALUES = {
-    ("gate", "departs"): "deviates_from_expert",
-    ("gate", "unlikely"): "action_probability",
-}
 BOTH, SEEDS, SCENARIOS, NOTHING = "seeds and scenarios", "seeds", "scenarios", ""
 
 
@@ -39,10 +35,10 @@ def known(name: str, value: str, allowed: Sequence[str]) -> None:
         UserError: One line.
     """
     if value not in allowed:
-        near = difflib.get_close_matches(value, allowed, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
         listed = ", ".join(repr(one) for one in allowed)
-        raise UserError(f"{name} must be one of {listed}, got {value!r}{hint}")
+        raise UserError(
+            f"{name} must be one of {listed}, got {value!r}{did_you_mean(value, allowed)}"
+        )
 
 
 @dataclasses.dataclass
@@ -161,7 +157,7 @@ def results_path(path: Path) -> Path:
     return found
 
 
-def read_csv(path: Path) -> DataFrame:
+def read_csv(path: Path) -> Frame:
     """A CSV file with every cell as text; an index column that pandas wrote is dropped.
 
     Raises:
@@ -170,14 +166,14 @@ def read_csv(path: Path) -> DataFrame:
     import pandas as pd
 
     try:
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+        frame: Frame = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:  # pandas' parsing errors are ValueErrors
         raise UserError(f"{str(path)!r} cannot be read: {error}") from error
     frame = frame.loc[:, [not str(name).startswith("Unnamed:") for name in frame.columns]]
-    frame = frame.rename(columns=_OLD_COLUMNS)
-    for (column, old), new in _OLD_VALUES.items():
+    frame = frame.rename(columns=RENAMED)
+    for column, renamed in RENAMED_VALUES.items():
         if column in frame:
-            frame[column] = frame[column].replace(old, new)
+            frame[column] = frame[column].replace(renamed)
     return frame
 
 
@@ -189,7 +185,7 @@ def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     frame.to_csv(path, index=False, lineterminator="\n")
 
 
-def _read_run(path: Path) -> DataFrame:
+def _read_run(path: Path) -> Frame:
     """The evaluations of a single run, a row per step and scenario."""
     if not (path / EVALUATION).is_file():
         raise UserError(f"run {str(path)!r} has no {EVALUATION} yet: nothing was evaluated")
@@ -208,7 +204,7 @@ def _read_run(path: Path) -> DataFrame:
     return frame
 
 
-def read_frame(path: Path) -> DataFrame:
+def read_frame(path: Path) -> Frame:
     """Result rows of a folder, a file or a single run, as text, without failed runs.
 
     Raises:
@@ -235,11 +231,11 @@ def read_frame(path: Path) -> DataFrame:
     return frame
 
 
-def _numbers(path: Path, frame: DataFrame, name: str, whole: bool = False) -> Any:
+def _numbers(path: Path, frame: Frame, name: str, whole: bool = False) -> Any:
     """A column as numbers; an empty cell of a measured one is NaN."""
     import pandas as pd
 
-    found = pd.to_numeric(frame[name], errors="coerce")
+    found: Any = pd.to_numeric(frame[name], errors="coerce")
     wrong = found.isna() & ((frame[name] != "") | whole)
     if whole:
         wrong |= found % 1 != 0
@@ -299,8 +295,8 @@ def _point(
     algorithm: str,
     values: dict[str, str],
     step: int,
-    group: DataFrame,
-    played: DataFrame | None,
+    group: Frame,
+    played: Frame | None,
 ) -> Point:
     """The runs of a group, and their episodes where all of them have the same scenarios."""
     whole = [name for name in MEASURED if name in group and not group[name].isna().any()]
@@ -325,7 +321,7 @@ def _point(
     return point
 
 
-def _episodes(path: Path) -> DataFrame | None:
+def _episodes(path: Path) -> Frame | None:
     """The rows per scenario that belong to a results file, if they are there."""
     results = results_path(path)
     names = [results.with_name(f"{results.stem}_episodes.csv")]
@@ -385,13 +381,8 @@ def reference_point(points: Sequence[Point], env: str, against: str | None = Non
 
 def _defaults(algorithm: str, env: str) -> dict[str, str]:
     """A method's default settings in a world, as text; empty where either is unknown here."""
-    from ppl_jax import config as core
-    from ppl_jax.algorithms import settings
-
     try:
-        found = settings(algorithm, env)
+        found = default_settings(algorithm, env)
     except ValueError:
         return {}
-    flat = getattr(core, "values", None)  # settings that methods own are flattened by it
-    pair = {k: v for part in found for k, v in dataclasses.asdict(part).items()}
-    return {k: _plain(str(v)) for k, v in (flat(*found) if flat else pair).items()}
+    return {k: _plain(str(v)) for k, v in setting_values(*found).items()}

@@ -64,7 +64,7 @@ def _draw(env: Any, at: int, played: Sequence[dict[str, Any]], number: int, *, o
     )
     reach = np.concatenate([run["position"] for run in played])
     low, high = reach.min(0) - 15, reach.max(0) + 15
-    drawn = None
+    drawn: Any = None
     for (road, line), run in zip(panels.T, played, strict=True):
         drawn = _draw_road(road, scene, run)
         road.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

@@ -169,8 +169,8 @@ def comparison_of(points: Sequence[Point], reference: Point) -> list[list[str]]:
         gap = difference(point, reference)
         chance = "-"
         if min(len(point.seeds), len(reference.seeds)) > 1:
-            scores = (one.measured["success"][None] for one in (point, reference))
-            chance = show(probability_of_improvement(*scores), 2)
+            ours, theirs = (one.measured["success"][None] for one in (point, reference))
+            chance = show(probability_of_improvement(ours, theirs), 2)
         values = [point.values.get(name, "-") for name in axes]
         rows.append([point.algorithm, *values, "-" if gap is None else show(gap, 2), chance])
     return rows

@@ -8,9 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.engine.run import RunSettings, build_world, check, open_folder
+from experiments.engine.run import build_world, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import RunSettings, check
 from experiments.ui.session import Question, Session, SessionConfig
 from experiments.ui.views import RATES
 

@@ -166,9 +166,7 @@ class ArmView:
 
     def __init__(self, env: Any, picture: Picture):
         self.env, self._picture = env, picture
-        from envs.manipulation.rendering import CAMERAS
-
-        self.azimuth = CAMERAS[env.name]["azimuth"]
+        self.azimuth = env.card.camera["azimuth"]
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_paint, args=(theirs, env.name), daemon=True)
@@ -187,15 +185,7 @@ class ArmView:
 
     def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
         """A few figures beside the picture."""
-        more = []
-        if hasattr(state, "wiped"):
-            left = len(state.wiped) - int(np.asarray(state.wiped).sum())
-            more = [
-                ["dirt left", f"{left} of {len(state.wiped)}"],
-                ["touching", "yes" if bool(state.contact) else "no"],
-            ]
-        if hasattr(state, "touching"):
-            more = [["ring held", "yes" if bool(state.touching) else "no"]]
+        more = [list(reading) for reading in self.env.readings(state)]
         return {"fails": shown.fails, "more": more}
 
     def picture(self, number: int, state: Any, shown: Shown) -> None:
