@@ -223,15 +223,15 @@ def _horizon(command: Horizon) -> None:
 
 
 def _table(command: Table) -> None:
-    from experiments.report.points import table
+    from experiments.report.tables import table
 
-    table(command)
+    table(**vars(command))
 
 
 def _figure(command: Figure) -> None:
     from experiments.report.figures import figure
 
-    figure(command)
+    figure(**vars(command))
     print(f"wrote {command.out}")
 
 

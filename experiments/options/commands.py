@@ -319,13 +319,14 @@ class Table:
     """Print results as a table: Markdown, LaTeX or plain."""
 
     results: Positional[Path]
-    """Folder of ppl sweep, compare or ablation, or its results.csv."""
+    """Run folder; folder of ppl sweep, compare, ablation or tune; or its results.csv."""
     step: int | None = None
-    """Environment steps (default: the end of each run)."""
+    """Environment steps (default: the end of each run; all of a single run)."""
     format: Literal["text", "markdown", "latex"] = "text"
     """How to write it."""
     against: str | None = None
-    """Row that the others are compared with (default: the first)."""
+    """Row that the others are compared with, such as "ppl beta=0.1" (default: the default settings
+    where they are there, else the first row)."""
     paper: bool = False
     """Show the paper's own figures beside ours."""
     env: str | None = None
@@ -337,8 +338,8 @@ class Figure:
     """Draw results."""
 
     results: Positional[Path]
-    """Folder of ppl sweep, compare or ablation, its results.csv, a folder of experts' cards, or
-    (kind steering) a run folder or policy file."""
+    """Run folder; folder of ppl sweep, compare, ablation or tune, or its results.csv; a folder of
+    experts' cards; or (kind steering) a policy file."""
     other: Positional[tuple[Path, ...]] = ()
     """Kind steering: more of them; kind horizon: results over L, to show beside."""
     kind: (
