@@ -235,9 +235,7 @@ class Sweep:
 
     envs: Positional[tuple[str, ...]]
     """Worlds: driving, table_wiping, nut_assembly."""
-    study: (
-        Literal["horizon", "horizon_beta", "prediction_noise", "expert_noise", "predictor"] | None
-    ) = None
+    study: str | None = None
     """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
     Values given replace the study's."""
     algorithms: tuple[str, ...] = ()

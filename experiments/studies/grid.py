@@ -68,6 +68,17 @@ STUDIES = {
 }
 
 
+def register_study(name: str, study: Study) -> None:
+    """Make a study known by name, to `ppl sweep --study NAME`.
+
+    Raises:
+        ValueError: If the name is taken.
+    """
+    if name in STUDIES:
+        raise ValueError(f"study {name!r} is registered already")
+    STUDIES[name] = study
+
+
 @dataclasses.dataclass(frozen=True)
 class Run:
     """One run of a sweep.
