@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envs import card, known, unknown
+from envs.registry import known, unknown
 from experiments.engine import schedulers as engines
 from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
@@ -36,6 +36,7 @@ from experiments.studies.grid import (
 )
 from experiments.studies.results import Results
 from ppl_jax import algorithms
+from ppl_jax.cards import card
 from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
