@@ -531,12 +531,12 @@ class Render:
 class Play:
     """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
 
-    env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
-    algorithm: str = "ppl"
-    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
-    seed: int = 0
-    """Random seed."""
+    env: Positional[str | None] = None
+    """Environment: driving, table_wiping or nut_assembly; with --resume that of the folder."""
+    algorithm: str | None = None
+    """Method that learns from you: ppl (default), pvp, hg_dagger, iwr, eil or haco."""
+    seed: int | None = None
+    """Random seed (default: 0)."""
     total_steps: int | None = None
     """Steps of the session."""
     preference_horizon: int | Literal["auto"] | None = None
@@ -545,18 +545,18 @@ class Play:
     """Temperature of the preference loss."""
     learning_rate: float | None = None
     """Of Adam."""
-    manual_episodes: int = 0
-    """So many episodes at the start are all yours."""
-    participant: str = ""
-    """Who you are in a study: at most 32 letters, digits, - and _."""
+    manual_episodes: int | None = None
+    """Number of episodes at the start in which you make every step (default: 0)."""
+    participant: str | None = None
+    """Your name in a study: at most 32 letters, digits, - and _."""
     consent: Path | None = None
     """Text file to agree to before anything starts."""
-    familiarisation: int = 0
-    """Successes in a row, driving alone, before it counts (the paper: 10)."""
+    familiarisation: int | None = None
+    """Successes in a row, driving alone, before steps count (default: 0; the paper: 10)."""
     questions: Path | None = None
     """JSON file of questions asked after every episode."""
     rate: float | None = None
-    """Steps per second (default: the world's own, 10 in driving and 20 for the arm)."""
+    """Steps per second (default: the environment's own, 10 in driving and 20 for the arm)."""
     scenarios: str | None = None
     """Folder of recorded scenarios to train on."""
     host: str = "127.0.0.1"
@@ -565,12 +565,12 @@ class Play:
     """Port to listen on; 0 takes a free one."""
     expose: bool = False
     """Allow a host that others on the network can reach."""
-    evaluate: bool = True
-    """Play the held-out scenarios at the end."""
+    evaluate: bool | None = None
+    """Play the held-out scenarios at the end (default: yes)."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
-    """Go on with the session in --out."""
+    """Continue the session in --out; its settings come from there."""
 
 
 @dataclasses.dataclass
@@ -885,40 +885,43 @@ def _render(command: Render) -> None:
 
 def _play(command: Play) -> None:
     from experiments.engine.runtime import start_jax
-    from experiments.ui.play import play, read_consent, read_questions
-    from experiments.ui.session import SessionConfig
-    from experiments.ui.views import RATES
+    from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 
-    shared = {f.name for f in dataclasses.fields(Train)}
-    given = {name: v for name, v in dataclasses.asdict(command).items() if name in shared}
-    settings = run_settings(Train(**given, expert="person"))
-    rate = command.rate or RATES.get(command.env, 10.0)
-    if not 0.1 <= rate <= 1000:
-        raise UserError(f"rate must lie between 0.1 and 1000, got {rate}")
-    if command.resume and command.out is None:
-        raise UserError("--resume needs --out, the run folder to go on with")
-    sitting = SessionConfig(
-        rate=rate,
-        participant=command.participant,
-        consent=None if command.consent is None else read_consent(command.consent),
-        familiarisation=command.familiarisation,
-        questions=() if command.questions is None else read_questions(command.questions),
-        evaluate=command.evaluate,
-    )
+    given = {
+        name: value
+        for name, value in vars(command).items()
+        if value is not None and name not in ("out", "resume", "host", "port", "expose")
+    }
+    if command.consent is not None:
+        given["consent"] = read_consent(command.consent)
+    if command.questions is not None:
+        given["questions"] = read_questions(command.questions)
+    if command.resume:
+        if command.out is None:
+            raise UserError("--resume needs --out, the run folder to continue")
+        out = command.out
+        settings, session_config = resumed(out, given)
+    else:
+        if command.env is None:
+            raise UserError("env: name the environment, such as driving")
+        shared = {f.name for f in dataclasses.fields(Train)}
+        asked = {name: value for name, value in given.items() if name in shared}
+        train = Train(**asked, expert="person")
+        settings, session_config = run_settings(train), new_session(command.env, given)
+        out = command.out or _new_folder(train)
     start_jax()
     play(
         settings,
-        command.out or _new_folder(command),
-        command.resume,
-        sitting,
-        command.manual_episodes,
-        command.host,
-        command.port,
-        command.expose,
+        out,
+        session_config,
+        resume=command.resume,
+        host=command.host,
+        port=command.port,
+        exposed=command.expose,
     )
 
 
-def _new_folder(command: Train | Play) -> Path:
+def _new_folder(command: Train) -> Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     return Path("runs") / f"{command.env}-{command.algorithm}-{command.seed}-{stamp}"
 

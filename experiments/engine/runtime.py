@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -17,6 +18,18 @@ _PACKAGES = ("ppl-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "n
 
 class UserError(Exception):
     """A mistake in what was asked for: one line, exit code 2."""
+
+
+def need(module: str, extra: str, what: str) -> Any:
+    """Import a module that only an extra installs.
+
+    Raises:
+        UserError: One line with the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"{what} needs {module}: pip install 'ppl-jax[{extra}]'") from error
 
 
 def cache_folder() -> Path:

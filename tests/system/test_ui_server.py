@@ -19,7 +19,7 @@ from experiments.ui.server import COOKIE, Hub, listen, serve
 
 
 class Echo:
-    """A performance that only notes what it is told."""
+    """A backend that only notes its messages."""
 
     lingers = False
 
@@ -54,7 +54,9 @@ class Served:
         self.socket = listen("127.0.0.1", 0, exposed=False)
         self.port = self.socket.getsockname()[1]
         self.thread = threading.Thread(
-            target=serve, args=(self.hub, self.echo, self.socket, False, self.told.append)
+            target=serve,
+            args=(self.hub, self.echo, self.socket),
+            kwargs={"tell": self.told.append},
         )
 
     @property
@@ -224,7 +226,7 @@ def test_only_this_machine_unless_asked_for():
             listen("127.0.0.1", port, exposed=False)
 
 
-def test_a_performance_that_breaks_ends_the_server():
+def test_a_backend_that_breaks_ends_the_server():
     hub, echo = Hub(2), Echo()
     echo.run = lambda: 1 / 0
     with listen("127.0.0.1", 0, exposed=False) as socket, pytest.raises(ZeroDivisionError):

@@ -94,7 +94,7 @@ def test_whose_action_is_executed_and_stored():
     assert bool(row.takeover_start)
 
 
-def test_foresight_leaves_no_trace_and_is_what_then_happens():
+def test_a_predicted_path_leaves_no_trace_and_is_what_then_happens():
     _, fns = live()
     learner = fns.init(jax.random.key(0), HP)
     for mine in (True, False):
