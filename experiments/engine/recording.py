@@ -70,7 +70,7 @@ def _flat(tree: Any) -> dict[str, Any]:
     return {"/".join(key.name for key in path): leaf for path, leaf in leaves}
 
 
-def row_of(step: Interaction, state: Any) -> dict[str, np.ndarray]:
+def row_of(step: Interaction, state: Any) -> dict[str, Any]:
     """A step as a row of columns; `state` is the environment's before it."""
     row = {_RENAMED.get(name, name): np.asarray(leaf) for name, leaf in _flat(step).items()}
     return row | {STATE + name: np.array(leaf) for name, leaf in _flat(state).items()}
@@ -82,7 +82,7 @@ class Recorder:
     def __init__(self, run: Path):
         self.folder = run / FOLDER
         self.episode = 0
-        self.rows: list[dict[str, np.ndarray]] = []
+        self.rows: list[dict[str, Any]] = []
 
     def add(self, step: Interaction, state: Any, ahead: PredictedPath) -> None:
         """Take a step, the state before it and the predicted path that was shown."""
@@ -94,12 +94,12 @@ class Recorder:
         """The episode was left unfinished."""
         self.episode += 1
 
-    def take(self) -> list[dict[str, np.ndarray]]:
+    def take(self) -> list[dict[str, Any]]:
         """Hand the steps so far over to the caller, which writes them."""
         rows, self.rows = self.rows, []
         return rows
 
-    def write(self, rows: list[dict[str, np.ndarray]], events: int) -> None:
+    def write(self, rows: list[dict[str, Any]], events: int) -> None:
         """Write a piece: the steps up to line `events` of the log."""
         if not rows:
             return

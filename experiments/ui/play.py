@@ -102,8 +102,9 @@ def new_session(env: str, given: Mapping[str, Any]) -> SessionConfig:
         UserError: If the environment cannot be shown.
     """
     names = {field.name for field in dataclasses.fields(SessionConfig)}
-    mine = {name: value for name, value in given.items() if name in names}
-    return SessionConfig(**{"rate": display_of(env).control_rate} | mine)
+    mine: dict[str, Any] = {"rate": display_of(env).control_rate}
+    mine |= {name: value for name, value in given.items() if name in names}
+    return SessionConfig(**mine)
 
 
 def resumed(out: Path, given: Mapping[str, Any]) -> tuple[RunSettings, SessionConfig]:

@@ -12,6 +12,7 @@ pytest.importorskip("uvicorn")
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from experiments.engine.runtime import UserError
 from experiments.ui.protocol import Input, Order
@@ -48,6 +49,13 @@ class Echo:
         return {"kind": "status", "stage": "running"}
 
 
+class Broken(Echo):
+    """A backend that fails."""
+
+    def run(self):
+        raise ZeroDivisionError
+
+
 class Served:
     def __init__(self):
         self.echo, self.hub, self.told = Echo(), Hub(2), []
@@ -80,7 +88,7 @@ class Served:
     def page(self, cookie, origin=None):
         return connect(
             f"ws://127.0.0.1:{self.port}/talk",
-            origin=origin or f"http://127.0.0.1:{self.port}",
+            origin=Origin(origin or f"http://127.0.0.1:{self.port}"),
             additional_headers={"Cookie": cookie},
         )
 
@@ -227,7 +235,6 @@ def test_only_this_machine_unless_asked_for():
 
 
 def test_a_backend_that_breaks_ends_the_server():
-    hub, echo = Hub(2), Echo()
-    echo.run = lambda: 1 / 0
+    hub, echo = Hub(2), Broken()
     with listen("127.0.0.1", 0, exposed=False) as socket, pytest.raises(ZeroDivisionError):
         serve(hub, echo, socket, tell=lambda line: None)
