@@ -278,7 +278,7 @@ def preset_values(preset: str, env: str) -> dict[str, Any]:
     overshoots (`ppl_jax.distributions`).
 
     `paper`: the paper's formula to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias
-    1. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is the one
+    1. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is that
     under which its formula has an optimum.
 
     `reference`: the released code's settings (metadriverse/PPL at 7a55c24), for driving alone.

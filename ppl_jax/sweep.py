@@ -37,8 +37,8 @@ class RunHistory(NamedTuple):
     diverged: jax.Array
 
 
-RunFn = Callable[[jax.Array, HParams, PyTree], RunHistory]
-"""`lane(key, hparams, held_out_params) -> RunHistory`."""
+RunFn = Callable[[jax.Array, HParams, PyTree], Any]
+"""`run(key, hparams, held_out_params) -> RunHistory`."""
 
 
 def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
@@ -66,7 +66,7 @@ def make_run(
     program.
 
     Args:
-        env: The world; its held-out parameters are an argument of the lane, not a constant.
+        env: The world; its held-out parameters are an argument of the run, not a constant.
         functions: Of the method (`ppl_jax.training.make_train`).
         config: Static settings.
         keep_policy: Return (RunHistory, the policy's layers at the end) instead.
@@ -89,7 +89,7 @@ def make_run(
         episodes = make_evaluate(env, act)(held_out, jax.random.key(0))
         return RunHistory(episodes, learner.counters, learner.diverged)
 
-    def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
+    def run(key: jax.Array, hparams: HParams, held_out: PyTree) -> Any:
         learner, curves = functions.init(key, hparams), []
 
         def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, RunHistory]:
@@ -114,23 +114,23 @@ def make_run(
             return history, functions.algorithm.policy(learner.algorithm)
         return history
 
-    return lane
+    return run
 
 
 def make_batch(
-    lane: RunFn, side_by_side: bool
+    run: RunFn, side_by_side: bool
 ) -> Callable[[jax.Array, HParams, PyTree], RunHistory]:
     """`batch(keys [B], hparams [B], held_out_params) -> RunHistory` with a leading [B].
 
     Args:
-        lane: One run.
+        run: One run.
         side_by_side: Step the runs together (`vmap`), or one after another (`lax.map`).
     """
     if side_by_side:
-        return jax.vmap(lane, in_axes=(0, 0, None))
+        return jax.vmap(run, in_axes=(0, 0, None))
 
     def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
-        return jax.lax.map(lambda run: lane(run[0], run[1], held_out), (keys, hparams))
+        return jax.lax.map(lambda one: run(one[0], one[1], held_out), (keys, hparams))
 
     return one_after_another
 
