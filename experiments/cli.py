@@ -178,10 +178,12 @@ def _evaluate(command: Evaluate) -> None:
 
 
 def _compare(command: Compare) -> None:
+    from experiments.engine.runtime import start_jax
     from experiments.report import paper
     from experiments.report.tables import EPISODES, print_comparison
     from experiments.studies.compare import compare
 
+    start_jax()
     try:
         compare(command)
     finally:
@@ -189,10 +191,12 @@ def _compare(command: Compare) -> None:
 
 
 def _ablation(command: Ablation) -> None:
+    from experiments.engine.runtime import start_jax
     from experiments.report import paper
     from experiments.report.tables import EPISODES, print_comparison
     from experiments.studies.ablation import ablation
 
+    start_jax()
     try:
         ablation(command)
     finally:
@@ -200,8 +204,10 @@ def _ablation(command: Ablation) -> None:
 
 
 def _tune(command: Tune) -> None:
+    from experiments.engine.runtime import start_jax
     from experiments.studies.tune import tune
 
+    start_jax()
     tune(command)
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,15 +54,21 @@ class Worker:
             traced = split(traced, jax.devices())
         program, env, compile_s = self._program(job, traced)
         began = time.perf_counter()
-        curve = jax.block_until_ready(program(*traced, env.held_out_params))
+        params = env.held_out_params
+        if settings.evaluate_on == "training":
+            params = env.default_params
+        curve, layers = jax.block_until_ready(program(*traced, params))
         seconds = time.perf_counter() - began
-        numbers = env.scenario_numbers(env.held_out_params)
+        numbers = env.scenario_numbers(params)
+        layers = jax.tree.map(np.asarray, layers)
         curve = jax.tree.map(np.asarray, curve)
         runs = [
             {"index": run["index"]}
             | _rows(job, jax.tree.map(lambda leaf, i=i: leaf[i], curve), numbers)
             for i, run in enumerate(batch)
         ]
+        if job.get("policies"):
+            _save_policies(job, settings, env, layers)
         return {"compile_s": compile_s, "seconds": seconds, "runs": runs}
 
     def _program(self, job: Job, traced: Any) -> tuple[Any, Any, float]:
@@ -79,12 +86,31 @@ class Worker:
         settings = RunSettings.from_json(job["settings"])
         env, expert = make_env_and_expert(settings)
         functions = make_train(env, expert, algorithm_factory(settings, env), settings.config)
-        lane = make_run(env, functions, settings.config, settings.evaluate_every)
+        lane = make_run(env, functions, settings.config, settings.evaluate_every, keep_policy=True)
         batch = make_batch(lane, job["side_by_side"])
+        params = env.held_out_params
+        if settings.evaluate_on == "training":
+            params = env.default_params
         began = time.perf_counter()
-        program = jax.jit(batch).lower(*traced, env.held_out_params).compile()
+        program = jax.jit(batch).lower(*traced, params).compile()
         self.programs[key] = (program, env)
         return program, env, time.perf_counter() - began
+
+
+def _save_policies(job: Job, settings: Any, env: Any, layers: Any) -> None:
+    """Write the trained policy of each run to the job's folder."""
+    import jax
+
+    from experiments.engine.policy_file import save_policy
+    from experiments.engine.run import saved_policy
+
+    folder = Path(job["policies"])
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, run in enumerate(job["runs"]):
+        mine = jax.tree.map(lambda leaf, i=i: leaf[i], layers)
+        about = {"env": settings.env, "algorithm": settings.algorithm, "seed": run["seed"]}
+        about["step"] = settings.config.total_steps
+        save_policy(folder / run["policy"], saved_policy(env, mine), about)
 
 
 def _rows(job: Job, curve: Any, numbers: Any) -> Reply:

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from experiments.report.tables import EPISODES, RESULTS
-from experiments.studies.compare import Row, budget, check_counts, run_rows
+from experiments.studies.compare import settings_of
+from experiments.studies.grid import Run
+from experiments.studies.runner import POLICIES, Execution, execute, policy_name
+from ppl_jax.cards import card
+from ppl_jax.losses import NEEDS_REFERENCE
 
 if TYPE_CHECKING:
-    from experiments.cli import Ablation
+    from experiments.options.commands import Ablation
 
-ROWS: dict[str, tuple[str, ...]] = {
-    "PPL": (),
-    "imitation on a+": ("--objective", "imitation"),
-    "random a+": ("--preferred", "random"),
-    "random a-": ("--rejected", "random"),
-    "DPO": ("--objective", "dpo"),
-    "IPO": ("--objective", "ipo"),
-    "SLiC-HF": ("--objective", "slic_hf"),
-    "BC loss only": ("--preference-weight", "0"),
-    "CPO loss only": ("--bc-weight", "0"),
-    "rule-based f": ("--predictor", "kinematic"),
+ROWS: dict[str, Mapping[str, Any]] = {
+    "PPL": {},
+    "imitation on a+": {"objective": "imitation"},
+    "random a+": {"preferred": "random"},
+    "random a-": {"rejected": "random"},
+    "DPO": {"objective": "dpo"},
+    "IPO": {"objective": "ipo"},
+    "SLiC-HF": {"objective": "slic_hf"},
+    "BC loss only": {"preference_weight": 0.0},
+    "CPO loss only": {"bc_weight": 0.0},
+    "rule-based f": {"predictor": "kinematic"},
 }
-LIBRARY: dict[str, tuple[str, ...]] = {
-    "IPO, library target": ("--objective", "ipo", "--objective-target", "library"),
-    "SLiC-HF, library target": ("--objective", "slic_hf", "--objective-target", "library"),
+LIBRARY: dict[str, Mapping[str, Any]] = {
+    "IPO, library target": {"objective": "ipo", "objective_target": "library"},
+    "SLiC-HF, library target": {"objective": "slic_hf", "objective_target": "library"},
 }
 
 
@@ -34,28 +37,33 @@ def ablation(command: Ablation) -> None:
     """Train every row with every seed; the reference policy of DPO and IPO comes first.
 
     Raises:
-        UserError: If a setting is wrong or a run failed (the others go on).
+        UserError: If a setting is wrong or a run failed (the others are run all the same).
     """
-    check_counts(command)
     rows = ROWS | LIBRARY
-    if command.env != "driving":
-        del rows["rule-based f"]  # its predictor is a bicycle
-    reference = _reference(command)
-    jobs = []
-    for label, words in rows.items():
-        if "dpo" in words or "ipo" in words:
-            words = (*words, "--reference-policy", str(reference))
-        signs = label.replace("a+", "preferred").replace("a-", "rejected").replace(",", "")
-        folder = signs.replace("-", "_").replace(" ", "_").lower()
-        jobs.append(Row(label, folder, (*words, *budget(command))))
-    run_rows(command, jobs)
+    predictors = card(command.env).predictors
+    rows = {
+        label: given
+        for label, given in rows.items()
+        if given.get("predictor", "simulator") in predictors
+    }
+    execution = Execution(processes=command.processes)
+    reference = str(_reference(command, execution))
+    runs = []
+    for seed in command.seeds:
+        for label, given in rows.items():
+            needs = given.get("objective") in NEEDS_REFERENCE
+            common = {"reference_policy": reference} if needs else {}
+            settings = settings_of(command, "ppl", seed, given, **common)
+            name = f"{command.env}/{label}/seed={seed}"
+            runs.append(Run(name, (), settings, label))
+    execute(runs, command.out, execution)
 
 
-def _reference(command: Ablation) -> Path:
+def _reference(command: Ablation, execution: Execution) -> Path:
     """Clone `reference_steps` expert steps, once; the policy file."""
-    steps = str(command.reference_steps)
-    words = ("--algorithm", "bc", "--demonstrations", steps, "--total-steps", steps)
-    run_rows(dataclasses.replace(command, seeds=(0,)), [Row("reference", "reference", words)])
-    for name in (RESULTS, EPISODES):
-        (command.out / name).unlink()
-    return command.out / "reference-0" / "policy.npz"
+    steps = {"demonstrations": command.reference_steps, "total_steps": command.reference_steps}
+    settings = settings_of(command, "bc", 0, steps, own_length=True)
+    run = Run(f"{command.env}/reference/seed=0", (), settings, "reference")
+    out = command.out.with_name(f"{command.out.name}-reference")
+    execute([run], out, execution)
+    return out / POLICIES / policy_name(run.name)

@@ -84,14 +84,16 @@ class Run:
     """One run of a sweep.
 
     Attributes:
-        name: Of its row: world, method, values and seed.
+        name: Of its row: environment, label, values and seed.
         values: Of every axis.
         settings: Of the run.
+        label: What tables call it; the method where it is empty.
     """
 
     name: str
     values: tuple[tuple[str, Any], ...]
     settings: RunSettings
+    label: str = ""
 
 
 @dataclasses.dataclass

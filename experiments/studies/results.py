@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,16 +58,28 @@ class Results:
         """Runs whose results are there."""
         return len(self.rows)
 
-    def read(self) -> set[str]:
+    def read(self, before: Mapping[str, Any]) -> set[str]:
         """Names of the runs that are there whole; what a kill cut off is dropped.
 
-        Runs that the sweep does not name are kept.
+        A run counts as there where one with the same settings is, whatever it was called: another
+        axis renames runs and adds columns. Runs that are not asked for now are kept.
+
+        Args:
+            before: The settings of the runs in the folder by name, as in its sweep.json.
 
         Raises:
-            UserError: If the files have other columns.
+            UserError: If the files are those of something else.
         """
-        rows = _read(self.out / RESULTS, self.columns)
-        episodes = _read(self.out / EPISODES, self.episode_columns)
+        rows, columns = _read(self.out / RESULTS)
+        episodes, episode_columns = _read(self.out / EPISODES)
+        self.columns = list(dict.fromkeys([*self.columns, *columns]))
+        self.episode_columns = list(dict.fromkeys([*self.episode_columns, *episode_columns]))
+        known = {_key(settings): name for name, settings in before.items()}
+        for run in self.runs:
+            old = known.get(_key(json.loads(json.dumps(run.settings.as_json()))))
+            if old is not None and old != run.name and old in rows and run.name not in rows:
+                rows[run.name] = [self._renamed(run, row) for row in rows.pop(old)]
+                episodes[run.name] = [self._renamed(run, row) for row in episodes.pop(old, [])]
         named = {run.name for run in self.runs}
         self.kept = {
             name: (mine, episodes.get(name, [])) for name, mine in rows.items() if name not in named
@@ -81,6 +94,11 @@ class Results:
         if rows or episodes:
             self.write_sorted()
         return set(self.rows)
+
+    def _renamed(self, run: Run, row: dict[str, str]) -> dict[str, str]:
+        """A row of a run that another sweep called otherwise."""
+        values = {name: plain(value) for name, value in run.values}
+        return row | {k: str(v) for k, v in self._where(run).items()} | values
 
     def add(self, run: Run, reply: dict[str, Any]) -> None:
         """A run that came back: its rows go to the files at once."""
@@ -101,7 +119,7 @@ class Results:
         return {
             "run": run.name,
             "env": settings.env,
-            "algorithm": settings.algorithm,
+            "algorithm": run.label or settings.algorithm,
             "seed": settings.seed,
         }
 
@@ -151,16 +169,26 @@ class Results:
             write_text_atomic(self.out / name, text.getvalue())
 
 
-def _read(path: Path, columns: Sequence[str]) -> dict[str, list[dict[str, str]]]:
-    """Rows by run; a last line without its end is left out."""
+def _key(settings: Mapping[str, Any]) -> str:
+    """Equal for the same run; the bound on L, which only sets a buffer's width, does not matter."""
+    kept = dict(settings)
+    kept["settings"] = {
+        k: v for k, v in kept.get("settings", {}).items() if k != "max_preference_horizon"
+    }
+    return json.dumps(kept, sort_keys=True)
+
+
+def _read(path: Path) -> tuple[dict[str, list[dict[str, str]]], list[str]]:
+    """Rows by run, and the columns; a last line without its end is left out."""
     text = path.read_text() if path.is_file() else ""
     reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
-    if reader.fieldnames and list(reader.fieldnames) != list(columns):
-        raise UserError(f"{str(path)!r} has the columns of another sweep: give another --out")
+    columns = list(reader.fieldnames or [])
+    if columns and "run" not in columns:
+        raise UserError(f"{str(path)!r} is not of this kind of results: give another --out")
     found: dict[str, list[dict[str, str]]] = {}
     for row in reader:
         found.setdefault(row["run"], []).append(row)
-    return found
+    return found, columns
 
 
 def _append(path: Path, columns: Sequence[str], rows: Sequence[dict[str, str]]) -> None:

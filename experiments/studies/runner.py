@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from experiments.engine.settings import (
     check,
     default_interval,
     flat,
+    one_level,
     run_settings,
     traced_values,
 )
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 SETTINGS = "sweep.json"
 LOG = "workers.log"
+POLICIES = "policies"  # folder of the trained policies, a file per run
 COMPILE_S = 25.0  # of a program that was never compiled before
 
 
@@ -155,40 +158,74 @@ def _settings(
 _COMMON = ("preset", "expert", "scenarios", "held_out_scenarios")
 
 
+@dataclasses.dataclass(frozen=True)
+class Execution:
+    """How runs are executed.
+
+    Attributes:
+        engine: "local" (processes of this machine) or "ray".
+        address: Of a running Ray cluster; one on this machine where None.
+        processes: Runs at the same time, on a CPU.
+        batch: Runs per program; None lets the machine decide.
+        dry_run: Say how much work it is, and stop.
+    """
+
+    engine: str = "local"
+    address: str | None = None
+    processes: int = 2
+    batch: int | None = None
+    dry_run: bool = False
+
+
 def sweep(command: Sweep) -> None:
-    """Run what is not there yet, and write results as they come.
+    """Run a grid: what is not there yet; results are written as they come.
 
     Raises:
-        UserError: If a setting is wrong, or a run failed (the others go on).
+        UserError: If a setting is wrong, or a run failed (the others are run all the same).
+    """
+    if not command.envs:
+        raise UserError("envs: name at least one environment")
+    execution = Execution(
+        engine=command.engine,
+        address=command.address,
+        processes=command.processes,
+        batch=command.batch,
+        dry_run=command.dry_run,
+    )
+    execute(plan(command), command.out, execution)
+
+
+def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
+    """Make the runs that are not there yet, and write results as they come.
+
+    Raises:
+        UserError: If a setting is wrong, or a run failed (the others are run all the same).
     """
     for name, least in (("processes", 1), ("batch", 1)):
-        value = getattr(command, name)
+        value = getattr(execution, name)
         if value is not None and value < least:
             raise UserError(f"{name} must be at least {least}, got {value}")
-    if not command.envs:
-        raise UserError("envs: name at least one world")
-    runs = plan(command)
-    results = Results(command.out, runs)
-    content = {"runs": {run.name: _json(run.settings) for run in runs}}
-    if command.dry_run:
-        _tell_plan(runs, runs, command)
+    results = Results(out, runs)
+    if execution.dry_run:
+        _tell_plan(runs, runs, execution)
         return
-    _open(command.out, content)
-    done = results.read()
+    before = _open(out, {run.name: _json(run.settings) for run in runs})
+    done = results.read(before)
     waiting = [run for run in runs if run.name not in done]
-    batch = _tell_plan(runs, waiting, command)
-    jobs = list(_jobs(groups(waiting), runs, batch))
-    log = command.out / LOG
+    batch = _tell_plan(runs, waiting, execution)
+    policies = None if execution.engine == "ray" else str((out / POLICIES).resolve())
+    jobs = list(_jobs(groups(waiting), runs, batch, policies))
     failed = {}
     with Progress(len(runs), "runs", len(done)) as progress:
         progress.start()
-        for number, reply in _engine(command, [job for job, _ in jobs], log):
-            compiling = reply.get("compile_s", 0.0) / _workers(command)
+        for number, reply in _engine(execution, [job for job, _ in jobs], out / LOG):
+            compiling = reply.get("compile_s", 0.0) / _workers(execution)
             progress.began += compiling  # says nothing of what is left
             for run, rows in _replies(reply, jobs[number], runs):
                 if isinstance(rows, str):
                     failed[run.name] = rows
                     results.fail(run, rows)
+                    print(f"{run.name}: {rows}", file=sys.stderr)
                 else:
                     results.add(run, rows)
                 progress.update(results.count + len(failed), results.note(run))
@@ -201,37 +238,50 @@ def sweep(command: Sweep) -> None:
         )
 
 
+def policy_name(run: str) -> str:
+    """The file name of a run's policy, in the folder `policies`."""
+    return re.sub(r"[^A-Za-z0-9_.=,-]+", "_", run) + ".npz"
+
+
 def _json(settings: RunSettings) -> dict[str, Any]:
     return json.loads(json.dumps(settings.as_json()))
 
 
-def _open(out: Path, content: dict[str, Any]) -> None:
+def _open(out: Path, asked: dict[str, Any]) -> dict[str, Any]:
     """Make the folder of a sweep, or check that what is in it has the same settings.
 
-    More runs (seeds, values) may join; those that are there must be the same.
+    More runs (seeds, values, axes) may join; those that are there must be the same.
+
+    Returns:
+        The settings of the runs in it by name, as they were before.
 
     Raises:
         UserError: If they are not.
     """
     path = out / SETTINGS
+    before: dict[str, Any] = {}
     if path.is_file():
         before = json.loads(path.read_text())["runs"]
-        for name, settings in content["runs"].items():
-            for field, value in settings.items():
-                if name in before and before[name].get(field) != value:
+        for name in asked.keys() & before.keys():
+            held, wanted = one_level(before[name]), one_level(asked[name])
+            for field, value in wanted.items():
+                if field not in _MAY_DIFFER and held.get(field) != value:
                     raise UserError(
-                        f"{str(out)!r} holds {name} with {field} {before[name].get(field)!r}, "
-                        f"asked for {value!r}: give another --out"
+                        f"{str(out)!r} holds {name} with {field} {held.get(field)!r}, asked for "
+                        f"{value!r}: give another --out"
                     )
-        content = {"runs": before | content["runs"]}
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(f"{str(out)!r} holds something else: give another --out")
     out.mkdir(parents=True, exist_ok=True)
-    about = {"versions": versions(), "revision": revision()}
-    write_text_atomic(path, json.dumps(about | content, indent=1) + "\n")
+    content = {"versions": versions(), "revision": revision(), "runs": before | asked}
+    write_text_atomic(path, json.dumps(content, indent=1) + "\n")
+    return before
 
 
-def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:
+_MAY_DIFFER = ("schema", "max_preference_horizon")  # the second only bounds L
+
+
+def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], execution: Execution) -> int:
     """Say how much work it is; returns the runs per batch."""
     from experiments.engine.run import algorithm_factory, make_env_and_expert
     from ppl_jax.sweep import run_bytes
@@ -239,7 +289,7 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> i
 
     wanted = groups(waiting)
     steps = sum(run.settings.config.total_steps for run in waiting)
-    workers = _workers(command)
+    workers = _workers(execution)
     seconds = sum(
         card(run.settings.env).step_ms
         * algorithms.method(run.settings.algorithm).cost
@@ -249,7 +299,7 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> i
         for run in waiting
     )
     memory = 0
-    for group in wanted if command.engine == "local" else ():
+    for group in wanted if execution.engine == "local" else ():
         env, expert = make_env_and_expert(group.settings)
         try:
             made = make_train(
@@ -258,7 +308,7 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> i
         except ValueError:
             continue  # its runs will say so; the others go on
         memory = max(memory, run_bytes(made, group.settings.hparams))
-    batch = command.batch or _batch(memory, len(waiting))
+    batch = execution.batch or _batch(memory, len(waiting))
     compiles = len({(group_key(g.settings), min(len(g.runs), batch)) for g in wanted})
     minutes = (seconds + COMPILE_S * compiles * min(workers, 2)) / workers / 60
     print(
@@ -277,8 +327,8 @@ def _accelerated() -> bool:
     return jax.default_backend() != "cpu"
 
 
-def _workers(command: Sweep) -> int:
-    return 1 if command.engine == "local" and _accelerated() else command.processes
+def _workers(execution: Execution) -> int:
+    return 1 if execution.engine == "local" and _accelerated() else execution.processes
 
 
 def _batch(run_bytes: int, runs: int) -> int:
@@ -295,7 +345,7 @@ def _batch(run_bytes: int, runs: int) -> int:
 
 
 def _jobs(
-    wanted: Sequence[Group], runs: Sequence[Run], batch: int
+    wanted: Sequence[Group], runs: Sequence[Run], batch: int, policies: str | None
 ) -> Iterator[tuple[Job, list[Run]]]:
     """Batches of each group; the last is filled up with copies, so that one program serves all."""
     index = {run.name: number for number, run in enumerate(runs)}
@@ -307,10 +357,12 @@ def _jobs(
             job = {
                 "settings": _json(dataclasses.replace(group.settings, seed=0)),
                 "side_by_side": _accelerated(),
+                "policies": policies,
                 "runs": [
                     {
                         "index": index[run.name],
                         "seed": run.settings.seed,
+                        "policy": policy_name(run.name),
                         "hparams": traced_values(run.settings),
                     }
                     for run in filled
@@ -319,12 +371,12 @@ def _jobs(
             yield job, mine
 
 
-def _engine(command: Sweep, jobs: Sequence[Job], log: Path) -> Iterator[tuple[int, Reply]]:
-    if command.engine == "ray":
-        return engines.ray_cluster(jobs, command.address)
+def _engine(execution: Execution, jobs: Sequence[Job], log: Path) -> Iterator[tuple[int, Reply]]:
+    if execution.engine == "ray":
+        return engines.ray_cluster(jobs, execution.address)
     if _accelerated():
         return engines.here(jobs)
-    return engines.local(jobs, command.processes, log)
+    return engines.local(jobs, execution.processes, log)
 
 
 def _replies(

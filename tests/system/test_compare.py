@@ -66,14 +66,17 @@ def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp
     out = tmp_path / "c"
     words = ["compare", "probe", "--algorithms", "hg_dagger", "broken", "pvp", *SMALL, "--out", out]
     done = program(tmp_path, *words, code=2)
-    assert "broken-0" in done.stderr
+    assert "probe/broken/-/seed=0" in done.stderr
     assert "this method is broken" in done.stderr
-    assert "4 of 6 are there" in done.stderr
+    assert "2 of 6 runs failed" in done.stderr
     assert "6/6" in done.stderr  # progress
     assert "hg_dagger" in done.stdout
     assert "pvp" in done.stdout
     with open(out / "results.csv", newline="") as file:
         rows = list(csv.DictReader(file))
+    failed = [row for row in rows if row["status"].startswith("failed")]
+    assert {row["algorithm"] for row in failed} == {"broken"}
+    rows = [row for row in rows if row["status"] == "done"]
     assert len(rows) == 2 * 2 * 2  # methods x seeds x evaluations
     with open(out / "episodes.csv", newline="") as file:
         episodes = list(csv.DictReader(file))
@@ -83,20 +86,19 @@ def test_one_broken_method_does_not_stop_the_rest_and_the_comparison_resumes(tmp
         mine = [e for e in episodes if (e["algorithm"], e["seed"]) == ("pvp", row["seed"])]
         assert float(row["success"]) == np.mean([float(e["success"]) for e in mine])
         assert row["discount"] == "0.9"  # every hyper-parameter is a column
-    before = {path: path.stat().st_mtime for path in out.rglob("summary.json")}
+    before = {path: path.stat().st_mtime for path in (out / "policies").iterdir()}
     assert len(before) == 4
     again = program(tmp_path, *words, code=2)
-    assert {path: path.stat().st_mtime for path in out.rglob("summary.json")} == before
+    assert {path: path.stat().st_mtime for path in (out / "policies").iterdir()} == before
     assert again.stdout == done.stdout
     other = program(tmp_path, *words[:-2], "--gate", "deviates_from_expert", "--out", out, code=2)
-    assert not (out / "broken-0" / "summary.json").exists()
     assert (
-        "were made with gate None, asked for 'deviates_from_expert': give another --out"
+        "with gate 'unsafe_or_slow', asked for 'deviates_from_expert': give another --out"
         in other.stderr
     )
-    (out / "settings.json").unlink()
+    (out / "sweep.json").unlink()
     unknown = program(tmp_path, *words, code=2)
-    assert "holds runs of something else: give another --out" in unknown.stderr
+    assert "holds something else: give another --out" in unknown.stderr
 
 
 @pytest.mark.slow
