@@ -8,7 +8,6 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,6 +39,7 @@ from experiments.options.commands import (
     Table,
     Tune,
 )
+from ppl_jax import __version__
 
 HELP_ALL = "--help-all"
 _PLAIN = {
@@ -450,7 +450,7 @@ def main(argv: list[str] | None = None) -> None:
 
         return serve()
     if words == ["--version"]:
-        print(f"ppl-jax {metadata.version('ppl-jax')}")
+        print(f"ppl-jax {__version__}")
         return
     try:
         command = parse(words)

@@ -68,7 +68,7 @@ def test_a_run_prints_its_table_and_leaves_a_run_folder(run):
         assert name in summary
     assert summary["episodes"] == 50
     config = json.loads((out / "config.json").read_text())
-    assert {"config", "hparams", "versions", "device", "revision"} <= set(config)
+    assert {"schema", "settings", "versions", "device", "revision"} <= set(config)
     steps = [json.loads(line)["step"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert steps == [20, 40, 60]
     lines = (out / "evaluation.csv").read_text().splitlines()
