@@ -62,3 +62,51 @@ def test_own_scene_is_drawn(tmp_path):
         "np.testing.assert_allclose(twin.arm.data.mocap_pos[0], state.goal, atol=1e-6)\n"
     )
     run(tmp_path, "-c", code)
+
+
+PROBE = """
+import ppl_jax
+from tests.helpers import Probe
+ppl_jax.register("probe", Probe)
+if __name__ == "__main__":"""
+
+
+def script(folder, name):
+    """An example's copy that knows the probe environment, which compiles in a moment."""
+    text = (EXAMPLES / name).read_text()
+    (folder / name).write_text(text.replace('\nif __name__ == "__main__":', PROBE))
+    return name
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "setting"),
+    [
+        ("own_gate.py", ["--gate", "brakes_late"], ("max_speed_near", 8.0, 3.0)),
+        ("own_predictor.py", ["--predictor", "sluggish"], ("lag", 0.3, 0.6)),
+    ],
+)
+def test_own_gate_and_predictor_own_a_setting(tmp_path, name, option, setting):
+    program = script(tmp_path, name)
+    field, default, other = setting
+    flag = f"--{field.replace('_', '-')}"
+    told = run(tmp_path, program, "train", "probe", *option, "--help")
+    assert flag in told
+    run(tmp_path, program, "train", "probe", *option, flag, str(other), *SHORT, "--out", "r")
+    config = json.loads((tmp_path / "r" / "config.json").read_text())
+    assert config["settings"][field] == other
+    swept = [flag, str(default), str(other), "--seeds", "1", *SHORT, "--out", "s"]
+    run(tmp_path, program, "sweep", "probe", *option, *swept)
+    rows = (tmp_path / "s" / "results.csv").read_text().splitlines()
+    assert field in rows[0].split(",")
+    assert len(rows) == 1 + 2
+
+
+def test_own_study_is_a_sweep(tmp_path):
+    program = script(tmp_path, "own_study.py")
+    words = ["sweep", "probe", "--study", "interval", "--seeds", "1", "--total-steps", "40"]
+    run(tmp_path, program, *words, "--batch-size", "8", "--out", "s")
+    rows = (tmp_path / "s" / "results.csv").read_text().splitlines()
+    assert {row.split(",")[2] for row in rows[1:]} == {"ppl", "hg_dagger"}
+    assert {row.split("/")[2] for row in rows[1:]} == {
+        f"decision_interval={k}" for k in (5, 10, 20)
+    }
