@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import subcommand
 
 from envs.compiler import set_xla_flags
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, hide_compiler_logs
 from experiments.engine.schedulers import SERVE
 from experiments.options.commands import (
     Ablation,
@@ -223,15 +223,15 @@ def _horizon(command: Horizon) -> None:
 
 
 def _table(command: Table) -> None:
-    from experiments.report.points import table
+    from experiments.report.tables import table
 
-    table(command)
+    table(**vars(command))
 
 
 def _figure(command: Figure) -> None:
     from experiments.report.figures import figure
 
-    figure(command)
+    figure(**vars(command))
     print(f"wrote {command.out}")
 
 
@@ -243,7 +243,7 @@ def _expert(command: Expert) -> None:
     else:
         from experiments.report.card import write_card
 
-        write_card(command.command.run, command.command.out)
+        write_card(command.command.run, command.command.out, force=command.command.force)
 
 
 def _expert_train(command: ExpertTrain) -> None:
@@ -437,6 +437,7 @@ _ACTIONS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
+    hide_compiler_logs()
     words = sys.argv[1:] if argv is None else argv
     if words == [SERVE]:
         from experiments.engine.worker import serve

@@ -286,9 +286,7 @@ def preset_values(preset: str, env: str) -> dict[str, Any]:
     about_env = card(env)
     if preset in about_env.missing_presets:
         others = [name for name in PRESETS if name not in about_env.missing_presets]
-        raise ValueError(
-            f"preset {preset!r} is not for {env}: choose {' or '.join(others)}"
-        )
+        raise ValueError(f"preset {preset!r} is not for {env}: choose {' or '.join(others)}")
     own = about_env.changes(preset)
     if preset == "reference":
         return {**_REFERENCE, **own}
@@ -375,8 +373,6 @@ def check_value(name: str, value: Any, about: About) -> None:
     shown = numbers.tolist() if numbers.ndim else value
     if name == "hidden":
         shown = value
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{name} must be a finite number, got {shown}")
     low, high = about.low, about.high
     if low is not None and high is not None and not ((numbers >= low) & (numbers <= high)).all():
         raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {shown}")
@@ -385,6 +381,8 @@ def check_value(name: str, value: Any, about: About) -> None:
         raise ValueError(f"{name} must {allowed}, got {shown}")
     if high is not None and not (numbers <= high).all():
         raise ValueError(f"{name} must be at most {high:g}, got {shown}")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be a finite number, got {shown}")
 
 
 def as_arrays(hparams: HParams) -> HParams:

@@ -52,7 +52,14 @@ def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
     return steps if steps and steps[-1] == end else [*steps, end]
 
 
-def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> RunFn:
+def make_run(
+    env: Env,
+    functions: TrainFunctions,
+    config: TrainConfig,
+    every: int,
+    *,
+    keep_policy: bool = False,
+) -> RunFn:
     """One whole run as a function: `RunHistory` at `evaluation_steps(config, every)`.
 
     It trains what `ppl train` trains, number for number, but holds the evaluations in the
@@ -62,6 +69,7 @@ def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: in
         env: The world; its held-out parameters are an argument of the lane, not a constant.
         functions: Of the method (`ppl_jax.training.make_train`).
         config: Static settings.
+        keep_policy: Return (RunHistory, the policy's layers at the end) instead.
         every: Steps between evaluations; a multiple of the decision interval and of the method's
             rounds.
     """
@@ -101,7 +109,10 @@ def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: in
                 curves.append(one(last))
         if not curves:  # demonstrations that nothing is learnt from
             curves.append(one(look(learner, held_out)))
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *curves)
+        history = jax.tree.map(lambda *parts: jnp.concatenate(parts), *curves)
+        if keep_policy:
+            return history, functions.algorithm.policy(learner.algorithm)
+        return history
 
     return lane
 

@@ -13,23 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment
-from ppl_jax import algorithms, checkpoint
-from ppl_jax.config import TrainConfig
+from ppl_jax import algorithms, checkpoint, gates, predictors
+from ppl_jax.config import HParams, TrainConfig, replace, values
 from ppl_jax.types import EnvSpec, Outcome
 
 ROOT = Path(__file__).parent.parent
-TINY = TrainConfig(
-    total_steps=800,
-    batch_size=32,
-    hidden=(32,),
-    prediction_horizon=6,
-    decision_interval=5,
-    max_preference_horizon=6,
-    human_capacity=2000,
-    preference_capacity=2000,
-    members=3,
-    rollout_steps=100,
-)
+TINY = {
+    "total_steps": 800,
+    "batch_size": 32,
+    "hidden": (32,),
+    "prediction_horizon": 6,
+    "decision_interval": 5,
+    "max_preference_horizon": 6,
+    "human_capacity": 2000,
+    "preference_capacity": 2000,
+    "members": 3,
+    "rollout_steps": 100,
+}
 OWN = {
     "bc": {"total_steps": 200, "demonstrations": 200, "offline_updates": 400},
     "gail": {"total_steps": 8200, "demonstrations": 200},
@@ -286,20 +286,42 @@ class Endless(TwoSteps):
         return state, outcome
 
 
+def plain_settings(name, **changes):
+    """(config, hparams) of a method with the classes' own defaults, and some changed by name."""
+    chosen = {k: changes[k] for k in ("gate", "predictor") if k in changes}
+    spec = algorithms.method(name)
+    config = TrainConfig(**chosen, method=spec.config())
+    hparams = HParams(
+        method=spec.hparams(),
+        gate=gates.gate(config.gate).hparams(),
+        predictor=predictors.predictor(config.predictor).hparams(),
+    )
+    return replace(config, hparams, **changes)
+
+
+def tiny_settings(name, **changes):
+    """The same, tiny."""
+    config, hparams = plain_settings(name, **{k: changes[k] for k in changes if k == "gate"})
+    known = values(config, hparams)
+    tiny = {k: v for k, v in TINY.items() if k in known}
+    return plain_settings(name, **(tiny | changes))
+
+
 def probe_settings(name, **changes):
     """A method's settings, tiny, with some changed."""
-    _, own = algorithms.settings(name, "probe")
-    hparams = dataclasses.replace(
-        own,
-        learning_rate=3e-3,
-        discriminator_rate=1e-3,
-        polyak_tau=0.02,
-        survival_correction=1.0,  # success ends the episode in these worlds
-    )
-    static = {k: v for k, v in changes.items() if hasattr(TINY, k)}
-    traced = {k: v for k, v in changes.items() if k not in static}
-    config = dataclasses.replace(TINY, **(OWN.get(name, {}) | static))
-    return config, dataclasses.replace(hparams, **traced)
+    chosen = {k: changes[k] for k in ("gate", "predictor") if k in changes}
+    config, _ = tiny_settings(name, **chosen, **OWN.get(name, {}))
+    _, hparams = algorithms.settings(name, "probe", **chosen)
+    known = values(config, hparams)
+    faster = {
+        "learning_rate": 3e-3,
+        "discriminator_rate": 1e-3,
+        "polyak_tau": 0.02,
+        "survival_correction": 1.0,  # success ends the episode in these worlds
+    }
+    config, hparams = replace(config, hparams, **{k: v for k, v in faster.items() if k in known})
+    others = {k for k in TINY if k not in known}  # what only other methods have
+    return replace(config, hparams, **{k: v for k, v in changes.items() if k not in others})
 
 
 def outcome(out):

@@ -118,8 +118,8 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
         if done >= plan[-1].end:
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
-    runner = _Runner(settings, folder, env, functions)
     with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
+        runner = _Runner(settings, folder, env, functions, progress)
         waiting = [chunk for chunk in plan if chunk.end > done]
         runner.compile(learner, waiting[-1])
         progress.start()
@@ -237,9 +237,15 @@ class _Runner:
     """Compiled functions of a run and what happens between its chunks."""
 
     def __init__(
-        self, settings: RunSettings, folder: RunFolder, env: Env, functions: TrainFunctions
+        self,
+        settings: RunSettings,
+        folder: RunFolder,
+        env: Env,
+        functions: TrainFunctions,
+        progress: Progress,
     ):
         self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
+        self.progress = progress
         self.compile_s = self.train_s = 0.0
         self.trained_steps = 0
         self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
@@ -254,7 +260,9 @@ class _Runner:
 
             began = time.perf_counter()
             jitted = jax.jit(run, donate_argnums=0)
-            self.programs[kind] = jitted.lower(learner).compile()
+            what = f"{self.settings.algorithm} in {self.settings.env}, {chunk.phase}"
+            with self.progress.compiling(what, f"{what}, {chunk.length} steps"):
+                self.programs[kind] = jitted.lower(learner).compile()
             self.compile_s += time.perf_counter() - began
         return self.programs[kind]
 

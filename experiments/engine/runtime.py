@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -12,11 +13,33 @@ from typing import Any
 from envs.compiler import set_xla_flags
 
 CACHE_VARIABLE = "PPL_JAX_CACHE"
+LOG_VARIABLE = "TF_CPP_MIN_LOG_LEVEL"
 _PACKAGES = ("ppl-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
 class UserError(Exception):
     """A mistake in what was asked for: one line, exit code 2."""
+
+
+def need(module: str, extra: str, what: str) -> Any:
+    """Import a module that only an extra installs.
+
+    Raises:
+        UserError: One line with the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"{what} needs {module}: pip install 'ppl-jax[{extra}]'") from error
+
+
+def hide_compiler_logs() -> None:
+    """Keep XLA's own log, its slow-compile alarms among them, off the terminal.
+
+    JAX's exceptions and Python's warnings are not affected. Call before JAX is imported; processes
+    started later inherit it. A `TF_CPP_MIN_LOG_LEVEL` that the user set is kept: 0 shows all.
+    """
+    os.environ.setdefault(LOG_VARIABLE, "3")  # the alarms are logged as errors, which is level 2
 
 
 def cache_folder() -> Path:
@@ -29,8 +52,9 @@ def cache_folder() -> Path:
 
 
 def start_jax() -> None:
-    """Set compiler flags and turn the persistent compilation cache on. Call before JAX is used."""
+    """Set compiler flags, hide XLA's log, turn the compilation cache on. Call before using JAX."""
     set_xla_flags()
+    hide_compiler_logs()
     import jax
 
     folder = cache_folder()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from envs import known, unknown
+from envs.registry import known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values

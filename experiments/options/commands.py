@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, subcommand
 
 
 @dataclasses.dataclass
@@ -220,8 +220,10 @@ class ExpertCard:
 
     run: Positional[Path]
     """Run folder of `ppl expert train`."""
-    out: Path = Path("envs/pretrained")
-    """Folder to write to."""
+    out: Path = Path("expert_card")
+    """Folder to write to; never the package's own `envs/pretrained`."""
+    force: bool = False
+    """Replace the files of an earlier card in --out."""
 
 
 @dataclasses.dataclass
@@ -233,9 +235,7 @@ class Sweep:
 
     envs: Positional[tuple[str, ...]]
     """Worlds: driving, table_wiping, nut_assembly."""
-    study: (
-        Literal["horizon", "horizon_beta", "prediction_noise", "expert_noise", "predictor"] | None
-    ) = None
+    study: str | None = None
     """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
     Values given replace the study's."""
     algorithms: tuple[str, ...] = ()
@@ -254,6 +254,8 @@ class Sweep:
     """Folder of recorded scenarios to train on."""
     held_out_scenarios: str | None = None
     """Folder of recorded scenarios to evaluate on."""
+    axes: Suppress[Fixed[dict[str, tuple[Any, ...]]]] = dataclasses.field(default_factory=dict)
+    """Values of the settings."""
     engine: Literal["local", "ray"] = "local"
     """Processes of this machine, or tasks of a Ray cluster."""
     address: str | None = None
@@ -315,13 +317,14 @@ class Table:
     """Print results as a table: Markdown, LaTeX or plain."""
 
     results: Positional[Path]
-    """Folder of ppl sweep, compare or ablation, or its results.csv."""
+    """Run folder; folder of ppl sweep, compare, ablation or tune; or its results.csv."""
     step: int | None = None
-    """Environment steps (default: the end of each run)."""
+    """Environment steps (default: the end of each run; all of a single run)."""
     format: Literal["text", "markdown", "latex"] = "text"
     """How to write it."""
     against: str | None = None
-    """Row that the others are compared with (default: the first)."""
+    """Row that the others are compared with, such as "ppl beta=0.1" (default: the default settings
+    where they are there, else the first row)."""
     paper: bool = False
     """Show the paper's own figures beside ours."""
     env: str | None = None
@@ -333,8 +336,8 @@ class Figure:
     """Draw results."""
 
     results: Positional[Path]
-    """Folder of ppl sweep, compare or ablation, its results.csv, a folder of experts' cards, or
-    (kind steering) a run folder or policy file."""
+    """Run folder; folder of ppl sweep, compare, ablation or tune, or its results.csv; a folder of
+    experts' cards; or (kind steering) a policy file."""
     other: Positional[tuple[Path, ...]] = ()
     """Kind steering: more of them; kind horizon: results over L, to show beside."""
     kind: (

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from envs import known, registered
+from envs.registry import known, registered
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RENAMED, RENAMED_VALUES
 from ppl_jax import algorithms
@@ -130,7 +130,7 @@ def axis_fields(settings: Mapping[str, Setting], *, everything: bool) -> list[An
     """Fields of a dataclass with several values of every setting that a sweep may vary."""
     fields = []
     for name, one in settings.items():
-        if name in ("total_steps", "demonstrations"):
+        if name == "total_steps":
             continue
         listed = typing.get_origin(one.kind) is tuple
         kind: Any = str if listed else kind_of(one)

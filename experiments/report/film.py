@@ -14,7 +14,7 @@ import numpy as np
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import make_world, named_expert, run_options
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from ppl_jax import algorithms
 from ppl_jax.gates import gate
 from ppl_jax.predictors import predict
@@ -43,6 +43,9 @@ def render(run: str, number: int, out: Path, steps: int, world: str = "driving")
         raise UserError(f"out must end in {', '.join(SUFFIXES)}, got {str(out)!r}")
     if steps < 1:
         raise UserError(f"steps must be at least 1, got {steps}")
+    need("PIL", "render", "ppl render")
+    if out.suffix == ".mp4":
+        need("av", "render", "ppl render to .mp4")
     named = run in ("scripted", "neural")
     name, options = (world, {}) if named else run_options(Path(run))
     env = make_world(name, options)
@@ -111,6 +114,7 @@ def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
 
 
 def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    need("mujoco", "manipulation", f"drawing {env.name}")
     try:
         from envs.manipulation.rendering import ArmPaths, ArmScene
 

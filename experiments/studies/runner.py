@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envs import card
+from envs.registry import known, unknown
 from experiments.engine import schedulers as engines
+from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
 from experiments.engine.runtime import UserError, revision, versions
 from experiments.engine.settings import (
@@ -23,9 +23,21 @@ from experiments.engine.settings import (
     traced_values,
 )
 from experiments.engine.worker import Job, Reply
-from experiments.studies.grid import STUDIES, Group, Run, group_key, groups, points, run_name, widen
+from experiments.studies.grid import (
+    STUDIES,
+    Group,
+    Run,
+    Study,
+    group_key,
+    groups,
+    points,
+    run_name,
+    widen,
+)
 from experiments.studies.results import Results
 from ppl_jax import algorithms
+from ppl_jax.cards import card
+from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
     from experiments.cli import Sweep
@@ -35,45 +47,94 @@ LOG = "workers.log"
 COMPILE_S = 25.0  # of a program that was never compiled before
 
 
+def _study(command: Sweep) -> Study | None:
+    """The study that a command names.
+
+    Raises:
+        UserError: If there is none of that name.
+    """
+    if command.study is None:
+        return None
+    if command.study not in STUDIES:
+        raise UserError(
+            f"study must be one of {', '.join(STUDIES)}, got {command.study!r}"
+            + did_you_mean(command.study, STUDIES)
+        )
+    return STUDIES[command.study]
+
+
 def plan(command: Sweep) -> list[Run]:
     """The runs that a command asks for.
 
     Raises:
         UserError: If a setting cannot work, before anything is built.
     """
-    study = STUDIES[command.study] if command.study else None
-    algorithms = command.algorithms or (study.algorithms if study else ("ppl",))
     runs = []
     for env in command.envs:
-        for algorithm in algorithms:
-            for values in points(_axes(command, env)):
+        if not known(env):
+            raise UserError(unknown(env))
+        for algorithm in _algorithms(command):
+            for chosen in _points(command, env, algorithm):
                 for seed in command.seeds:
-                    settings = _settings(command, env, algorithm, values, seed)
+                    settings = _settings(command, env, algorithm, chosen, seed)
                     if settings is not None:
-                        name = run_name(env, algorithm, values, seed)
-                        runs.append(Run(name, tuple(values.items()), settings))
+                        name = run_name(env, algorithm, chosen, seed)
+                        runs.append(Run(name, tuple(chosen.items()), settings))
     return widen(runs)
 
 
 def _axes(command: Sweep, env: str) -> dict[str, tuple[Any, ...]]:
     given = dict(command.axes)
-    study = dict(STUDIES[command.study].axes) if command.study else {}
+    study = dict(found.axes) if (found := _study(command)) else {}
     if env != "driving" and command.study == "predictor" and "predictor" not in given:
         raise UserError(f"study predictor is for driving, which alone has two, got {env}")
     return study | given
 
 
+def _points(command: Sweep, env: str, algorithm: str) -> list[dict[str, Any]]:
+    """Every combination of the axes that a method has, each once.
+
+    Raises:
+        UserError: If no method of the sweep has an axis.
+    """
+    known = _known(command, env, algorithm)
+    everyone = set().union(*(_known(command, env, name) for name in _algorithms(command)))
+    axes = _axes(command, env)
+    for name in axes:
+        if name not in everyone:
+            raise UserError(f"unknown setting {name!r}{did_you_mean(name, everyone)}")
+    mine = {name: values for name, values in axes.items() if name in known}
+    return points(mine)
+
+
+def _algorithms(command: Sweep) -> tuple[str, ...]:
+    study = _study(command)
+    return command.algorithms or (study.algorithms if study else ("ppl",))
+
+
+def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
+    """The settings that runs of a method have, under any of the gates and predictors swept over."""
+    found: set[str] = set()
+    axes = {k: v for k, v in _axes(command, env).items() if k in ("gate", "predictor")}
+    for given in points(axes):
+        try:
+            found |= set(values(*algorithms.settings(algorithm, env, command.preset, **given)))
+        except ValueError as error:
+            raise UserError(str(error)) from error
+    return found
+
+
 def _settings(
-    command: Sweep, env: str, algorithm: str, values: dict[str, Any], seed: int
+    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], seed: int
 ) -> RunSettings | None:
     """Of one run; None where a study's L exceeds what the world predicts."""
-    given = dict(values)
+    given = dict(chosen)
     if command.total_steps is not None:
         given["total_steps"] = command.total_steps
     common = {name: getattr(command, name) for name in _COMMON}
     settings = run_settings(env, algorithm, seed, **common, given=given)
     config = settings.config
-    study = STUDIES[command.study] if command.study else None
+    study = _study(command)
     if study and command.total_steps is None and study.length != 1:
         config = dataclasses.replace(config, total_steps=int(config.total_steps * study.length))
     every = command.evaluate_every
@@ -167,9 +228,7 @@ def _open(out: Path, content: dict[str, Any]) -> None:
         raise UserError(f"{str(out)!r} holds something else: give another --out")
     out.mkdir(parents=True, exist_ok=True)
     about = {"versions": versions(), "revision": revision()}
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(about | content, indent=1) + "\n")
-    os.replace(temporary, path)
+    write_text_atomic(path, json.dumps(about | content, indent=1) + "\n")
 
 
 def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:

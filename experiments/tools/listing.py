@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from envs import card, registered
+from envs.registry import registered
 from experiments.studies.grid import STUDIES
 from ppl_jax import algorithms
+from ppl_jax.cards import card
 from ppl_jax.config import PRESETS
 from ppl_jax.gates import gate, registered_gates
 from ppl_jax.losses import OBJECTIVES
@@ -14,7 +15,9 @@ from ppl_jax.predictors import registered_predictors
 def listing() -> str:
     """Every name by kind, a line each."""
     sections = {
-        "environments": [f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()]
+        "environments": [
+            f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()
+        ]
         + ["brax:NAME        any environment of brax"],
         "methods": algorithms.registered(),
         "gates": [

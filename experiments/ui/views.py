@@ -216,8 +216,8 @@ def _paint(pipe: Any, name: str) -> None:
 
     from PIL import Image
 
-    from envs import make
     from envs.manipulation.rendering import ArmPaths, ArmScene
+    from envs.registry import make
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     scene = ArmScene(make(name), PICTURE, smooth=False)

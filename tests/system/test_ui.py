@@ -37,10 +37,11 @@ from experiments.ui.protocol import (
 from experiments.ui.session import ANSWERS, CONSENT, Question, Session, SessionConfig
 from experiments.ui.trainer import LOG, InteractiveTrainer
 from ppl_jax import algorithms, checkpoint
-from ppl_jax.config import HParams, TrainConfig
-from tests.helpers import Probe
+from tests.helpers import Probe, plain_settings
 
-CONFIG = TrainConfig(
+CONFIG, HP = plain_settings(
+    "ppl",
+    learning_rate=3e-3,
     total_steps=300,
     batch_size=16,
     hidden=(16,),
@@ -50,7 +51,7 @@ CONFIG = TrainConfig(
     human_capacity=300,
     preference_capacity=1000,
 )
-SETTINGS = RunSettings("probe", "ppl", 0, CONFIG, HParams(learning_rate=3e-3), expert="person")
+SETTINGS = RunSettings("probe", "ppl", 0, CONFIG, HP, expert="person")
 PROBE = Probe()
 
 
