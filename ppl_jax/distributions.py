@@ -76,7 +76,8 @@ def squashed_gaussian(
 
         log pi(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))
 
-    It is soft actor-critic's (Haarnoja et al. 2018, appendix C). The density is taken at u, so that nothing is inverted where tanh saturates.
+    It is soft actor-critic's (Haarnoja et al. 2018, appendix C). The density is taken at u, so that
+    nothing is inverted where tanh saturates.
 
     Args:
         key: Random key.

@@ -14,7 +14,6 @@ from ppl_jax.checks import check_name
 from ppl_jax.distributions import gaussian_log_prob
 from ppl_jax.types import Expert
 
-
 ACTIVATIONS, OUTPUTS = ("relu", "tanh"), ("tanh", "clip")
 
 

@@ -70,5 +70,5 @@ def test_a_mask_of_another_length_is_refused():
         ((np.zeros((4, 2)), np.zeros(3)), np.ones(4, bool)),
         ((np.zeros((4, 2)), np.zeros(4)), np.ones((4, 1), bool)),
     ):
-        with pytest.raises(AssertionError, match="shape|rank"):
+        with pytest.raises(AssertionError, match=r"shape|rank"):
             buffers.add(buffer, items, mask)

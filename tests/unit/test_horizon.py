@@ -87,11 +87,15 @@ def test_the_choice_balances_both_errors():
 def test_it_is_chosen_while_training():
     """Here the expert says the same everywhere: every label is right, so L is the most."""
     config, hparams = probe_settings(
-        "ppl", adaptive_horizon=True, max_preference_horizon=6, total_steps=400
+        "ppl",
+        adaptive_horizon=True,
+        max_preference_horizon=6,
+        preference_horizon=6,
+        total_steps=400,
     )
     functions = make_train(Probe(), Probe.scripted_expert, make(), config)
     run = jax.jit(functions.run_chunk, static_argnums=1)
-    learner = functions.init(jax.random.key(0), hparams.replace(preference_horizon=6))
+    learner = functions.init(jax.random.key(0), hparams)
     learner, metrics = run(learner, 40)
     assert int(learner.counters.human_data) > 0
     assert float(jnp.max(learner.algorithm.horizon.drift)) < 1e-6
@@ -123,7 +127,7 @@ def test_a_profile_of_a_world_that_is_known():
 
 
 def test_shapes_that_do_not_fit_are_refused():
-    here, ahead, actions = np.zeros(3), np.zeros((5, 3)), np.zeros((5, 2))
+    here, ahead, actions = np.ones(3), np.zeros((5, 3)), np.zeros((5, 2))
     one = {"expert_action": actions[0], "novice_action": actions[0], "scale": here}
     seen = horizon.measure(here, ahead, actions, **one)
     for call in (
@@ -136,5 +140,5 @@ def test_shapes_that_do_not_fit_are_refused():
         lambda: horizon.add(horizon.init_horizon(4), seen, np.ones(4, bool)),
         lambda: horizon.errors(np.zeros(3), np.zeros(4), 1.0),
     ):
-        with pytest.raises(AssertionError, match="shape|rank"):
+        with pytest.raises(AssertionError, match=r"shape|rank"):
             call()

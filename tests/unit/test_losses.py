@@ -1,4 +1,5 @@
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -181,9 +182,8 @@ PAIRS = pair_likelihoods(MEAN, GOOD, MEAN, BAD)
     ],
 )
 def test_an_unknown_name_is_refused_with_those_that_there_are(call, message):
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
         call()
-    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -206,6 +206,6 @@ def test_an_unknown_name_is_refused_with_those_that_there_are(call, message):
     ],
 )
 def test_shapes_that_do_not_fit_are_refused(call):
-    with pytest.raises(AssertionError, match="shape|broadcast|rank") as error:
+    with pytest.raises(AssertionError, match=r"shape|broadcast|rank") as error:
         call()
     assert "\n" not in str(error.value)
