@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -73,11 +74,21 @@ class Bound(NamedTuple):
 
 def total_variation(p: jax.Array, q: jax.Array, axis: int | tuple[int, ...] = -1) -> jax.Array:
     """D_TV = |P - Q|_1 / 2 over `axis`."""
+    chex.assert_equal_shape([p, q], custom_message="p and q")
     return 0.5 * jnp.sum(jnp.abs(p - q), axis)
+
+
+def _check(mdp: TabularMDP, *policies: jax.Array) -> None:
+    """Check that a world's arrays and policies [S, A] fit each other."""
+    states, actions = mdp.reward.shape
+    chex.assert_shape(mdp.transition, (states, actions, states))
+    chex.assert_shape(mdp.start, (states,))
+    chex.assert_shape(policies, (states, actions))
 
 
 def action_values(mdp: TabularMDP, policy: jax.Array) -> jax.Array:
     """Q of a policy [S, A]: Q = r + gamma P V, V = sum_a pi Q, [S, A]."""
+    _check(mdp, policy)
     moves = jnp.einsum("sa,sat->st", policy, mdp.transition)
     paid = jnp.sum(policy * mdp.reward, -1)
     value = jnp.linalg.solve(jnp.eye(paid.shape[0]) - mdp.discount * moves, paid)
@@ -86,6 +97,7 @@ def action_values(mdp: TabularMDP, policy: jax.Array) -> jax.Array:
 
 def occupancy(mdp: TabularMDP, policy: jax.Array) -> jax.Array:
     """d_pi(s) = (1 - gamma) sum_t gamma^t P(s_t = s), [S]."""
+    _check(mdp, policy)
     moves = jnp.einsum("sa,sat->st", policy, mdp.transition)
     matrix = jnp.eye(moves.shape[0]) - mdp.discount * moves.T
     return (1 - mdp.discount) * jnp.linalg.solve(matrix, mdp.start)
@@ -96,10 +108,11 @@ def preference_pairs(
     expert: jax.Array,
     novice: jax.Array,
     taken_over: jax.Array,
-    preference_horizon: jax.Array,
+    *,
+    preference_horizon: jax.Array | int,
     max_horizon: int,
 ) -> jax.Array:
-    """What D_pref tends to: the joint distribution of (state, a+, a-), [S, A, A].
+    """The limit of D_pref: the joint distribution of (state, a+, a-), [S, A, A].
 
         rho(s', a+, a-) = 1/L sum_{i=1..L} sum_s taken_over(s) h(a+|s) n(a-|s) P_{a-}^i(s, s')
 
@@ -113,6 +126,8 @@ def preference_pairs(
         preference_horizon: L, 1 to `max_horizon`.
         max_horizon: Static.
     """
+    _check(mdp, expert, novice)
+    chex.assert_equal_shape([taken_over, mdp.start], custom_message="taken_over and start")
     begun = jnp.einsum("s,sp,sn->nps", taken_over, expert, novice)  # [A-, A+, S]
     held = jnp.moveaxis(mdp.transition, 1, 0)  # [A-, S, S]
 
@@ -126,6 +141,8 @@ def preference_pairs(
 
 def preference_loss(pairs: jax.Array, policy: jax.Array, beta: jax.Array | float) -> jax.Array:
     """L_pref of a policy [S, A] on pairs [S, A, A]."""
+    states, actions = policy.shape
+    chex.assert_shape(pairs, (states, actions, actions))
     log = jnp.log(policy)
     margin = beta * (log[:, :, None] - log[:, None, :])
     return -jnp.sum(pairs * jax.nn.log_sigmoid(margin))
@@ -136,6 +153,7 @@ def bound(
     expert: jax.Array,
     novice: jax.Array,
     pairs: jax.Array,
+    *,
     beta: jax.Array | float,
 ) -> Bound:
     """Both sides of the theorem for policies h and n, [S, A] (all positive), and D_pref's pairs.
@@ -146,6 +164,7 @@ def bound(
         pairs: [S, A, A] distribution of (state, a+, a-), such as `preference_pairs` gives.
         beta: Temperature of the preference loss.
     """
+    _check(mdp, expert, novice)
     values = action_values(mdp, expert)
     value = jnp.sum(expert * values, -1)
     own = jnp.sum(novice * action_values(mdp, novice), -1)
@@ -163,7 +182,15 @@ def bound(
     wrong = 4 * (beta * log_ratio + jnp.log(2.0)) * delta_pref
     apart = jnp.sqrt(jnp.maximum(epsilon + wrong, 0) / (2 * beta) + beta * log_ratio**2 / 8)
     limit = spread / (1 - mdp.discount) * (2 * delta_dist + apart)
-    return Bound(gap, limit, delta_dist, delta_pref, epsilon, spread, log_ratio)
+    return Bound(
+        gap=gap,
+        bound=limit,
+        delta_dist=delta_dist,
+        delta_pref=delta_pref,
+        epsilon=epsilon,
+        spread=spread,
+        log_ratio=log_ratio,
+    )
 
 
 def random_mdp(key: jax.Array, states: int, actions: int, discount: float = 0.9) -> TabularMDP:
@@ -172,7 +199,7 @@ def random_mdp(key: jax.Array, states: int, actions: int, discount: float = 0.9)
     moves = jax.random.dirichlet(key_moves, jnp.full(states, 0.3), (states, actions))
     reward = jax.random.uniform(key_reward, (states, actions))
     start = jax.random.dirichlet(key_start, jnp.ones(states))
-    return TabularMDP(moves, reward, start, discount)
+    return TabularMDP(transition=moves, reward=reward, start=start, discount=discount)
 
 
 def random_policy(key: jax.Array, states: int, actions: int, sharpness: float = 1.0) -> jax.Array:

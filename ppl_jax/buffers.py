@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ class RingBuffer:
 def init_buffer(item: PyTree, capacity: int) -> RingBuffer:
     """An empty buffer for items like `item` (arrays or shapes)."""
     data = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), item)
-    return RingBuffer(data, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    return RingBuffer(data=data, next=jnp.zeros((), jnp.int32), added=jnp.zeros((), jnp.int32))
 
 
 def capacity(buffer: RingBuffer) -> int:
@@ -49,20 +50,25 @@ def add(buffer: RingBuffer, items: PyTree, mask: jax.Array) -> RingBuffer:
         buffer: Before.
         items: Pytree of [N, ...].
         mask: [N] bool.
+
+    Raises:
+        AssertionError: If shapes do not fit.
     """
+    chex.assert_rank(mask, 1)
+    chex.assert_tree_shape_prefix(items, mask.shape)
     rows = capacity(buffer)
     rank = jnp.cumsum(mask) - 1
     # rows past the end are dropped: that is where unselected items go
     row = jnp.where(mask, (buffer.next + rank) % rows, rows)
     data = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), buffer.data, items)
     count = jnp.sum(mask, dtype=jnp.int32)
-    return RingBuffer(data, (buffer.next + count) % rows, buffer.added + count)
+    return RingBuffer(data=data, next=(buffer.next + count) % rows, added=buffer.added + count)
 
 
 def sample(buffer: RingBuffer, key: jax.Array, count: int) -> PyTree:
-    """`count` items drawn with replacement; zeros from an empty buffer.
+    """`count` items drawn with replacement.
 
-    Whoever uses them must weigh a loss on an empty buffer with zero.
+    An empty buffer returns zeros; mask the loss.
     """
     index = jax.random.randint(key, (count,), 0, jnp.maximum(size(buffer), 1))
     return jax.tree.map(lambda leaf: leaf[index], buffer.data)
@@ -83,14 +89,17 @@ class SplitBuffer:
 
 def init_split(item: PyTree, human_capacity: int, robot_capacity: int) -> SplitBuffer:
     """Two empty buffers for items like `item`."""
-    return SplitBuffer(init_buffer(item, human_capacity), init_buffer(item, robot_capacity))
+    return SplitBuffer(
+        human=init_buffer(item, human_capacity), robot=init_buffer(item, robot_capacity)
+    )
 
 
 def add_split(split: SplitBuffer, item: PyTree, takeover: jax.Array) -> SplitBuffer:
     """Append one item to the one buffer or the other."""
     row = jax.tree.map(lambda leaf: leaf[None], item)
     return SplitBuffer(
-        add(split.human, row, takeover[None]), add(split.robot, row, ~takeover[None])
+        human=add(split.human, row, takeover[None]),
+        robot=add(split.robot, row, ~takeover[None]),
     )
 
 
@@ -111,7 +120,7 @@ def sample_split(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree
 
 
 def sample_both(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
-    """`count` items, every step alike whoever made it; weights like `sample_split`'s."""
+    """`count` items, the expert's and the novice's steps alike; weights like `sample_split`'s."""
     human, robot = size(split.human), size(split.robot)
     row = jax.random.randint(key, (count,), 0, jnp.maximum(human + robot, 1))
     ours = row < human

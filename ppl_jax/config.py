@@ -9,9 +9,8 @@ too. Names are unique among them, so that a run's settings are one flat list of 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import flax.struct
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax.cards import card
+from ppl_jax.checks import did_you_mean
 from ppl_jax.fields import About, about, setting
 
 
@@ -243,12 +243,6 @@ def replace(config: TrainConfig, hparams: HParams, **changes: Any) -> tuple[Trai
     owned = {name: changed(getattr(hparams, name)) for name in OWNED_HPARAMS}
     config = dataclasses.replace(changed(config), method=changed(config.method))
     return config, dataclasses.replace(changed(hparams), **owned)
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`: did you mean 'x'?` where a known name is near, else the empty string."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f": did you mean {near[0]!r}?" if near else ""
 
 
 def check_unique(*classes: type) -> None:

@@ -21,9 +21,13 @@ expert's clipped actions lie. Another b is the same as `beta` divided by it.
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.checks import check_name
+
+LIKELIHOODS = ("gaussian", "laplace")
 LAPLACE_SCALE = 0.1  # b
 LAPLACE_CORE = 0.1  # w
 
@@ -31,10 +35,19 @@ LAPLACE_CORE = 0.1  # w
 def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -> jax.Array:
     """Log pi(action | mean) up to a constant, [..., A], [..., A] -> [...].
 
+        gaussian    -|a - mu|^2
+        laplace     -(sqrt(|a - mu|^2 + w^2) - w) / b
+
     Args:
-        mean, action: In [-1, 1].
-        kind: "laplace" or "gaussian".
+        mean, action: [..., A] of the same shape, in [-1, 1].
+        kind: "gaussian" or "laplace".
+
+    Raises:
+        ValueError: If there is no such likelihood.
+        AssertionError: If the shapes differ.
     """
+    check_name("likelihood", kind, LIKELIHOODS)
+    chex.assert_equal_shape([mean, action], custom_message="mean and action")
     square = jnp.sum((action - mean) ** 2, -1)
     if kind == "gaussian":
         return -square
@@ -42,7 +55,16 @@ def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -
 
 
 def gaussian_log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
-    """Log-density of a Gaussian without squashing (PPO's), [..., A] -> [...]."""
+    """Log-density of a diagonal Gaussian without squashing (PPO's), [..., A] -> [...].
+
+        log N(a) = sum -((a - mu) / s)^2 / 2 - log s - log(2 pi) / 2
+
+    Args:
+        mean, action: [..., A] of the same shape.
+        log_std: log s, [..., A] or [A].
+    """
+    chex.assert_equal_shape([mean, action], custom_message="mean and action")
+    chex.assert_is_broadcastable(jnp.shape(log_std), jnp.shape(mean))
     scaled = (action - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), -1)
 
@@ -50,11 +72,12 @@ def gaussian_log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) ->
 def squashed_gaussian(
     key: jax.Array, mean: jax.Array, log_std: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """A reparameterised sample a = tanh(u), u ~ N(mean, std), and its log-density (SAC's).
+    """A reparameterised sample a = tanh(u), u ~ N(mean, std), and its log-density.
 
         log pi(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))
 
-    The density is taken at u, so that nothing is inverted where tanh saturates.
+    It is soft actor-critic's (Haarnoja et al. 2018, appendix C). The density is taken at u, so that
+    nothing is inverted where tanh saturates.
 
     Args:
         key: Random key.
@@ -64,6 +87,7 @@ def squashed_gaussian(
     Returns:
         [..., A] in [-1, 1], [...].
     """
+    chex.assert_equal_shape([mean, log_std], custom_message="mean and log_std")
     log_std = jnp.clip(log_std, -20.0, 2.0)
     u = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
     squashing = jnp.sum(2.0 * (jnp.log(2.0) - u - jax.nn.softplus(-2.0 * u)), -1)

@@ -6,11 +6,15 @@ import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.checks import check_name
 from ppl_jax.distributions import gaussian_log_prob
 from ppl_jax.types import Expert
+
+ACTIVATIONS, OUTPUTS = ("relu", "tanh"), ("tanh", "clip")
 
 
 class SavedPolicy(NamedTuple):
@@ -33,7 +37,15 @@ class SavedPolicy(NamedTuple):
 
 
 def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
-    """The deterministic action, [..., O] -> [..., A]."""
+    """The deterministic action, [..., O] -> [..., A].
+
+    Raises:
+        ValueError: If the policy's activation or output is unknown.
+        AssertionError: If the observation is not of the policy's size.
+    """
+    check_name("activation", policy.activation, ACTIVATIONS)
+    check_name("output", policy.output, OUTPUTS)
+    chex.assert_axis_dimension(observation, -1, policy.weights[0][0].shape[0])
     x = (observation - policy.obs_mean) / policy.obs_scale
     between = jnp.tanh if policy.activation == "tanh" else jax.nn.relu
     for w, b in policy.weights[:-1]:

@@ -23,12 +23,19 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.checks import check_name
 from ppl_jax.distributions import log_likelihood
 
 Metrics = dict[str, jax.Array]
+
+REDUCTIONS = ("sum", "mean")
+OBJECTIVES = ("cpo", "dpo", "ipo", "slic_hf", "imitation")
+TARGETS = ("pair", "library")
+NEEDS_REFERENCE = ("dpo", "ipo")
 
 
 def bc_loss(
@@ -36,18 +43,26 @@ def bc_loss(
     expert_action: jax.Array,
     likelihood: str = "gaussian",
     reduction: str = "sum",
+    *,
     weight: jax.Array | float = 1.0,
 ) -> tuple[jax.Array, Metrics]:
     """Behaviour cloning: -E[weight log pi(a_h|s)].
 
     Args:
         mean: [..., A] policy actions.
-        expert_action: [..., A].
+        expert_action: [..., A], of the same shape.
         likelihood: See `ppl_jax.distributions`.
         reduction: "sum" over action dimensions (the log-likelihood), or "mean" (the released
             code's mean squared error).
-        weight: [...] of mean 1.
+        weight: [...] of mean 1, or a number.
+
+    Raises:
+        ValueError: If a name is unknown.
+        AssertionError: If shapes do not fit.
     """
+    check_name("reduction", reduction, REDUCTIONS)
+    chex.assert_equal_shape([mean, expert_action], custom_message="mean and expert_action")
+    chex.assert_is_broadcastable(jnp.shape(weight), mean.shape[:-1])
     loss = -jnp.mean(weight * log_likelihood(mean, expert_action, likelihood))
     if reduction == "mean":
         loss = loss / mean.shape[-1]
@@ -74,11 +89,12 @@ def pair_likelihoods(
     preferred_action: jax.Array,
     rejected_mean: jax.Array,
     rejected_action: jax.Array,
+    *,
     bias: jax.Array | float = 1.0,
     likelihood: str = "gaussian",
     reference: tuple[jax.Array, jax.Array] | None = None,
 ) -> PairLikelihoods:
-    """What every objective needs of a batch of pairs.
+    """The log-likelihoods that every objective reads of a batch of pairs.
 
     Args:
         preferred_mean, rejected_mean: [B, A] policy actions at the states of either action (the
@@ -86,8 +102,17 @@ def pair_likelihoods(
         preferred_action, rejected_action: [B, A].
         bias: Factor on the rejected action's likelihood; 1 in the paper.
         likelihood: See `ppl_jax.distributions`.
-        reference: The reference policy's two means, like the first and third argument.
+        reference: The reference policy's two means, like `preferred_mean` and `rejected_mean`.
+
+    Raises:
+        ValueError: If the likelihood is unknown.
+        AssertionError: If shapes do not fit.
     """
+    means = [preferred_mean, rejected_mean, *(reference or ())]
+    chex.assert_equal_shape(
+        [*means, preferred_action, rejected_action], custom_message="means and actions"
+    )
+    chex.assert_rank(preferred_mean, 2)
 
     def log_pi(mean: jax.Array, action: jax.Array) -> jax.Array:
         return log_likelihood(mean, action, likelihood)
@@ -105,14 +130,11 @@ def pair_likelihoods(
     )
 
 
-OBJECTIVES = ("cpo", "dpo", "ipo", "slic_hf", "imitation")
-NEEDS_REFERENCE = ("dpo", "ipo")
-
-
 def preference_loss(
     pairs: PairLikelihoods,
     beta: jax.Array | float,
     bias: jax.Array | float = 1.0,
+    *,
     objective: str = "cpo",
     target: str = "pair",
 ) -> tuple[jax.Array, Metrics]:
@@ -125,7 +147,18 @@ def preference_loss(
             contrastive preference learning. The same as given to `pair_likelihoods`.
         objective: "cpo", "dpo", "ipo", "slic_hf" or "imitation".
         target: "pair" or "library".
+
+    Raises:
+        ValueError: If a name is unknown.
+        AssertionError: If shapes do not fit.
     """
+    check_name("objective", objective, OBJECTIVES)
+    check_name("target", target, TARGETS)
+    chex.assert_equal_shape(
+        [pairs.preferred, pairs.rejected, pairs.attained],
+        custom_message="preferred, rejected and attained",
+    )
+    chex.assert_is_broadcastable(jnp.shape(pairs.reference), pairs.preferred.shape)
     delta = pairs.preferred - bias * pairs.rejected
     gained = delta - pairs.reference
     if objective == "cpo":
@@ -137,10 +170,8 @@ def preference_loss(
         each = (gained - (0.5 / beta if target == "library" else reachable)) ** 2
     elif objective == "slic_hf":
         each = jax.nn.relu((1.0 if target == "library" else pairs.attained) - delta)
-    elif objective == "imitation":
+    else:  # imitation
         each = -pairs.preferred
-    else:
-        raise ValueError(f"unknown objective {objective!r}")
     loss = jnp.mean(each)
     return loss, {
         "loss_preference": loss,

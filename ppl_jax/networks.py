@@ -47,7 +47,10 @@ class Network(NamedTuple):
 def make_policy(spec: EnvSpec, hidden: tuple[int, ...]) -> Network:
     """A deterministic policy: tanh at the end, actions [..., A] in [-1, 1]."""
     raw = make_raw(spec, hidden, spec.action_size)
-    return Network(raw.init, lambda params, observation: jnp.tanh(raw.apply(params, observation)))
+    return Network(
+        init=raw.init,
+        apply=lambda params, observation: jnp.tanh(raw.apply(params, observation)),
+    )
 
 
 def make_raw(spec: EnvSpec, hidden: tuple[int, ...], outputs: int) -> Network:
@@ -61,7 +64,7 @@ def make_raw(spec: EnvSpec, hidden: tuple[int, ...], outputs: int) -> Network:
     def apply(params: Params, observation: jax.Array) -> jax.Array:
         return module.apply(params, (observation - mean) / scale)  # pyright: ignore[reportReturnType]
 
-    return Network(init, apply)
+    return Network(init=init, apply=apply)
 
 
 def make_critic(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Network:
@@ -81,7 +84,7 @@ def make_critic(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Network:
         values: jax.Array = jax.vmap(module.apply, in_axes=(0, None))(params, inputs)  # pyright: ignore[reportAssignmentType]
         return values[..., 0]
 
-    return Network(init, apply)
+    return Network(init=init, apply=apply)
 
 
 class Ensemble(NamedTuple):

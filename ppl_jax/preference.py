@@ -7,10 +7,14 @@ of the paper). L is traced: pairs past it are masked, so sweeping it compiles no
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 
+from ppl_jax.checks import check_name
 from ppl_jax.types import Interaction, PreferenceBatch
+
+PAIR_STATES = ("predicted", "shifted")
 
 
 def preference_pairs(
@@ -26,9 +30,18 @@ def preference_pairs(
 
     Returns:
         [M] pairs and their [M] mask.
+
+    Raises:
+        ValueError: If `pair_states` is unknown.
+        AssertionError: If shapes do not fit.
     """
+    check_name("pair_states", pair_states, PAIR_STATES)
     predicted = step.predicted
     count = predicted.valid.shape[0]
+    chex.assert_shape(predicted.observation, (count, *step.observation.shape))
+    chex.assert_equal_shape(
+        [step.expert_action, step.novice_action], custom_message="expert_action and novice_action"
+    )
     mask = step.takeover & predicted.valid & (jnp.arange(count) < preference_horizon)
 
     def repeat(action: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""What a learning method fills in, and what every gradient method shares."""
+"""The record that a learning method fills in, and the update that gradient methods share."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Learned:
     """Parameters with their optimiser.
 
     Attributes:
-        params: What acts while training.
+        params: They act while training.
         opt_state: Of Adam.
         updates: Number of updates so far.
         average: Moving average of `params`. Of a policy over the last thousand or so updates: what
@@ -87,7 +87,12 @@ class Learned:
 
 def init_learned(params: PyTree) -> Learned:
     """Before the first update."""
-    return Learned(params, _ADAM.init(params), jnp.zeros((), jnp.int32), params)
+    return Learned(
+        params=params,
+        opt_state=_ADAM.init(params),
+        updates=jnp.zeros((), jnp.int32),
+        average=params,
+    )
 
 
 def adam_step(
@@ -95,6 +100,7 @@ def adam_step(
     grads: PyTree,
     learning_rate: jax.Array | float,
     do: jax.Array | bool = True,
+    *,
     polyak_tau: jax.Array | float | None = None,
 ) -> Learned:
     """One step of Adam with a traced learning rate where `do`, else nothing.
@@ -119,14 +125,16 @@ def adam_step(
         average = jax.tree.map(
             lambda old, new: decay * old + (1 - decay) * new, learned.average, params
         )
-        return Learned(params, opt_state, learned.updates + 1, average)
+        return Learned(
+            params=params, opt_state=opt_state, updates=learned.updates + 1, average=average
+        )
 
     return jax.lax.cond(do, step, lambda learned: learned, learned)
 
 
 @flax.struct.dataclass
 class ActorCritic:
-    """What a method with critics learns.
+    """The parameters of a method with critics.
 
     Attributes:
         actor: `Learned` of the policy.

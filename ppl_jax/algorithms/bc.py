@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +18,8 @@ from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
 from ppl_jax.gates import never
 from ppl_jax.losses import Metrics, bc_loss
-from ppl_jax.networks import Layers, layers, make_policy
-from ppl_jax.types import EnvSpec, Interaction
+from ppl_jax.networks import Network, layers, make_policy
+from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 
 @flax.struct.dataclass
@@ -30,7 +31,7 @@ class ClonerHParams:
 
 @flax.struct.dataclass
 class ClonerState:
-    """What is learnt, and from what.
+    """The policy and its data.
 
     Attributes:
         learned: The policy.
@@ -41,57 +42,78 @@ class ClonerState:
     human_buffer: RingBuffer
 
 
+def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> ClonerState:
+    """Before the first step."""
+    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    rows = min(config.human_capacity, config.total_steps)
+    return ClonerState(
+        learned=init_learned(policy.init(key)), human_buffer=buffers.init_buffer(item, rows)
+    )
+
+
+def store(state: ClonerState, step: Interaction, hparams: HParams) -> ClonerState:
+    """Keep a step under the expert's control."""
+    del hparams
+    item = (step.observation[None], step.expert_action[None])
+    human = buffers.add(state.human_buffer, item, step.takeover[None])
+    return dataclasses.replace(state, human_buffer=human)
+
+
+def cloning_loss(
+    params: Any,
+    cloned: tuple[jax.Array, jax.Array],
+    hparams: HParams,
+    *,
+    policy: Network,
+    config: TrainConfig,
+) -> tuple[jax.Array, Metrics]:
+    """bc_weight L_bc on a batch of observations [B, O] and expert actions [B, A]."""
+    observation, action = cloned
+    mean = policy.apply(params, observation)
+    bc, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction)
+    return hparams.method.bc_weight * bc, metrics
+
+
+def update(
+    state: ClonerState, key: jax.Array, hparams: HParams, *, policy: Network, config: TrainConfig
+) -> tuple[ClonerState, Metrics]:
+    """One step of Adam on a batch of the expert's steps."""
+    cloned = buffers.sample(state.human_buffer, key, config.batch_size)
+    has_data = buffers.size(state.human_buffer) > 0
+    loss = functools.partial(cloning_loss, policy=policy, config=config)
+    grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, cloned, hparams)
+    learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+    return dataclasses.replace(state, learned=learned), metrics
+
+
 def make_bc(spec: EnvSpec, config: TrainConfig) -> Algorithm:
-    """BC: `demonstrations` steps of the expert, then `offline_updates`, and that is all."""
+    """BC: `demonstrations` steps of the expert, then `offline_updates`, and nothing else."""
     return make_cloner("bc", spec, config, never)
 
 
 def make_cloner(
-    name: str, spec: EnvSpec, config: TrainConfig, decide: Callable[..., jax.Array] | None
+    name: str,
+    spec: EnvSpec,
+    config: TrainConfig,
+    decide: Callable[[Any, DecisionPoint, HParams], jax.Array] | None,
 ) -> Algorithm:
-    """A policy that clones every step under the expert's control, whoever gave it control.
+    """A policy that clones every step under the expert's control, however it came to be.
 
-    L = -E_{D_h}[ log pi(a_h|s) ]
+        L = -E_{D_h}[ log pi(a_h|s) ]
+
+    Args:
+        name: Of the method.
+        spec: Of the environment.
+        config: Static settings.
+        decide: See `Algorithm.decide`.
     """
     policy = make_policy(spec, config.hidden)
-
-    def init(key: jax.Array) -> ClonerState:
-        item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-        rows = min(config.human_capacity, config.total_steps)
-        return ClonerState(init_learned(policy.init(key)), buffers.init_buffer(item, rows))
-
-    def act(state: ClonerState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return policy.apply(state.learned.params, observation)
-
-    def store(state: ClonerState, step: Interaction, hparams: HParams) -> ClonerState:
-        del hparams
-        item = (step.observation[None], step.expert_action[None])
-        human = buffers.add(state.human_buffer, item, step.takeover[None])
-        return dataclasses.replace(state, human_buffer=human)
-
-    def loss(params: Any, cloned: Any, hparams: HParams) -> tuple[jax.Array, Metrics]:
-        observation, action = cloned
-        mean = policy.apply(params, observation)
-        bc, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction)
-        return hparams.method.bc_weight * bc, metrics
-
-    def update(state: ClonerState, key: jax.Array, hparams: HParams) -> tuple[ClonerState, Metrics]:
-        cloned = buffers.sample(state.human_buffer, key, config.batch_size)
-        has_data = buffers.size(state.human_buffer) > 0
-        grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, cloned, hparams)
-        learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: ClonerState) -> Layers:
-        return layers(state.learned.average)
-
     return Algorithm(
         name=name,
-        init=init,
-        act=act,
+        init=functools.partial(init_state, policy=policy, spec=spec, config=config),
+        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
         decide=decide,
         store=store,
-        update=update,
-        policy=policy_layers,
+        update=functools.partial(update, policy=policy, config=config),
+        policy=lambda state: layers(state.learned.average),
     )

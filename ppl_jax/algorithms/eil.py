@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_learned
+from ppl_jax.algorithms.base import ActorCritic, Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
 from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
-from ppl_jax.networks import Layers, layers, make_critic, make_policy
+from ppl_jax.networks import Network, layers, make_critic, make_policy
 from ppl_jax.types import EnvSpec, Interaction
 
 OTHERS = 3  # uniform random actions that the expert's is held against
@@ -35,9 +37,16 @@ class EILHParams:
     )
 
 
+class Networks(NamedTuple):
+    """The networks: a policy and twin action values."""
+
+    policy: Network
+    critic: Network
+
+
 @flax.struct.dataclass
 class LabelledSteps:
-    """A step of the novice: `good` if no intervention followed within the window."""
+    """Steps of the novice: `good` if no intervention followed within the window."""
 
     observation: jax.Array
     action: jax.Array
@@ -58,14 +67,31 @@ class PendingSteps:
     count: jax.Array
 
 
+class Batch(NamedTuple):
+    """One half of the expert's steps, one half of the novice's: B each.
+
+    Attributes:
+        observation, expert_action: [B, O], [B, A] of the expert's steps.
+        others: [OTHERS + 1, B, A] actions that the expert's is held against.
+        labelled: The novice's, [B].
+        weight: 0 while there are none of these, else 1.
+    """
+
+    observation: jax.Array
+    expert_action: jax.Array
+    others: jax.Array
+    labelled: LabelledSteps
+    weight: jax.Array
+
+
 @flax.struct.dataclass
 class EILState:
-    """What is learnt, and from what.
+    """Policy and values, and their data.
 
     Attributes:
         learned: Policy and twin action values (without targets: nothing is bootstrapped).
         human_buffer: (observation, expert's action, novice's action) under the expert's control.
-        robot_buffer: `LabelledSteps` steps of the novice.
+        robot_buffer: `LabelledSteps`.
         waiting: Those still to be judged.
     """
 
@@ -93,12 +119,14 @@ def judge(
     observation = jnp.concatenate([waiting.observation, step.observation[None]])
     action = jnp.concatenate([waiting.action, step.executed_action[None]])
     good = jnp.broadcast_to(~step.takeover_start, chosen.shape)
-    robot = buffers.add(robot, LabelledSteps(observation, action, good), chosen)
+    robot = buffers.add(
+        robot, LabelledSteps(observation=observation, action=action, good=good), chosen
+    )
     count = jnp.where(novice & ~done, jnp.minimum(waiting.count + 1, window), 0)
     kept = PendingSteps(
-        jnp.where(novice, observation[1:], waiting.observation),
-        jnp.where(novice, action[1:], waiting.action),
-        count,
+        observation=jnp.where(novice, observation[1:], waiting.observation),
+        action=jnp.where(novice, action[1:], waiting.action),
+        count=count,
     )
     return robot, kept
 
@@ -108,6 +136,7 @@ def hinge_losses(
     good: jax.Array,
     expert_value: jax.Array,
     other_values: jax.Array,
+    *,
     distance: jax.Array,
     margin: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -127,11 +156,128 @@ def hinge_losses(
         other_values, distance: [K, N, B] and [N, B], of the actions a'.
         margin: m.
     """
+    chex.assert_shape(judged_value, (None, *good.shape))
+    chex.assert_shape(other_values, (expert_value.shape[0], *distance.shape))
+    chex.assert_shape(expert_value, (None, distance.shape[-1]))
     good_loss = jnp.sum(jnp.mean(good * jax.nn.relu(margin - judged_value), -1))
     bad_loss = jnp.sum(jnp.mean((1.0 - good) * jax.nn.relu(margin + judged_value), -1))
     gap = expert_value[:, None] - other_values
     compared = jnp.sum(jnp.mean(jax.nn.relu(margin * distance - gap), (-2, -1)))
     return good_loss, bad_loss, compared
+
+
+def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig) -> EILState:
+    """Before the first step."""
+    key_actor, key_critic = jax.random.split(key)
+    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    rows, window = min(config.human_capacity, config.total_steps), config.decision_interval
+    labelled = LabelledSteps(observation=observation, action=action, good=jnp.zeros((), bool))
+    return EILState(
+        learned=ActorCritic(
+            actor=init_learned(networks.policy.init(key_actor)),
+            critic=init_learned(networks.critic.init(key_critic)),
+        ),
+        human_buffer=buffers.init_buffer((observation, action, action), rows),
+        robot_buffer=buffers.init_buffer(labelled, rows),
+        waiting=PendingSteps(
+            observation=jnp.zeros((window, spec.observation_size)),
+            action=jnp.zeros((window, spec.action_size)),
+            count=jnp.zeros((), jnp.int32),
+        ),
+    )
+
+
+def store(state: EILState, step: Interaction, hparams: HParams) -> EILState:
+    """Keep a step of the expert, or judge one of the novice."""
+    del hparams
+    item = (step.observation[None], step.expert_action[None], step.novice_action[None])
+    robot, waiting = judge(state.robot_buffer, state.waiting, step)
+    return dataclasses.replace(
+        state,
+        human_buffer=buffers.add(state.human_buffer, item, step.takeover[None]),
+        robot_buffer=robot,
+        waiting=waiting,
+    )
+
+
+def sample_batch(state: EILState, key: jax.Array, half: int) -> Batch:
+    """`half` steps of either party, and the actions that the expert's are held against."""
+    key_human, key_robot, key_others = jax.random.split(key, 3)
+    observation, action, novices = buffers.sample(state.human_buffer, key_human, half)
+    labelled = buffers.sample(state.robot_buffer, key_robot, half)
+    random = jax.random.uniform(key_others, (OTHERS, *action.shape), minval=-1.0, maxval=1.0)
+    return Batch(
+        observation=observation,
+        expert_action=action,
+        others=jnp.concatenate([novices[None], random]),
+        labelled=labelled,
+        weight=(buffers.size(state.robot_buffer) > 0).astype(jnp.float32),
+    )
+
+
+def critic_loss(
+    params: Any, batch: Batch, margin: jax.Array | float, critic: Network
+) -> tuple[jax.Array, Metrics]:
+    """L_Q of a batch."""
+    observation, others, labelled = batch.observation, batch.others, batch.labelled
+    size = (others.shape[0], *observation.shape)
+    good, bad, compared = hinge_losses(
+        critic.apply(params, labelled.observation, labelled.action),
+        labelled.good,
+        critic.apply(params, observation, batch.expert_action),
+        critic.apply(params, jnp.broadcast_to(observation, size), others),
+        distance=jnp.sqrt(jnp.sum((others - batch.expert_action) ** 2, -1)),
+        margin=margin,
+    )
+    metrics = {"loss_good": good, "loss_bad": bad, "loss_compared": compared}
+    return batch.weight * (good + bad) + compared, metrics
+
+
+def actor_loss(
+    params: Any,
+    critics: Any,
+    batch: Batch,
+    *,
+    bc_weight: jax.Array | float,
+    networks: Networks,
+    likelihood: str,
+) -> jax.Array:
+    """L_mu of a batch; `critics` are the parameters of the values."""
+    half = batch.expert_action.shape[0]
+    observation = jnp.concatenate([batch.observation, batch.labelled.observation])
+    weight = jnp.concatenate([jnp.ones(half), batch.weight * jnp.ones(half)])
+    action = networks.policy.apply(params, observation)
+    value = networks.critic.apply(critics, observation, action)[0]
+    cloned = jnp.mean(log_likelihood(action[:half], batch.expert_action, likelihood))
+    return -jnp.mean(weight * value) - bc_weight * cloned
+
+
+def update(
+    state: EILState, key: jax.Array, hparams: HParams, *, networks: Networks, config: TrainConfig
+) -> tuple[EILState, Metrics]:
+    """One step of Adam for the values, and every second time for the policy."""
+    batch = sample_batch(state, key, config.batch_size // 2)
+    has_human = buffers.size(state.human_buffer) > 0
+    actor, critics = state.learned.actor, state.learned.critic
+    grads, metrics = jax.grad(critic_loss, has_aux=True)(
+        critics.params, batch, hparams.method.margin, networks.critic
+    )
+    critics = adam_step(critics, grads, hparams.learning_rate, has_human, polyak_tau=1.0)
+
+    def improve(actor: Learned) -> Learned:
+        loss = functools.partial(
+            actor_loss,
+            bc_weight=hparams.method.bc_weight,
+            networks=networks,
+            likelihood=config.likelihood,
+        )
+        grads = jax.grad(loss)(actor.params, critics.params, batch)
+        return adam_step(actor, grads, hparams.learning_rate)
+
+    turn = has_human & (critics.updates % POLICY_DELAY == 0)
+    actor = jax.lax.cond(turn, improve, lambda actor: actor, actor)
+    learned = ActorCritic(actor=actor, critic=critics)
+    return dataclasses.replace(state, learned=learned), metrics
 
 
 def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
@@ -143,115 +289,16 @@ def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     method picks from a library of actions; here the policy climbs Q, and l_C compares with random
     actions in the library's place.
     """
-    policy, critic = make_policy(spec, config.hidden), make_critic(spec, config.hidden, 2)
-    half = config.batch_size // 2
-
-    def init(key: jax.Array) -> EILState:
-        key_actor, key_critic = jax.random.split(key)
-        observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
-        rows, window = min(config.human_capacity, config.total_steps), config.decision_interval
-        return EILState(
-            learned=ActorCritic(
-                init_learned(policy.init(key_actor)), init_learned(critic.init(key_critic))
-            ),
-            human_buffer=buffers.init_buffer((observation, action, action), rows),
-            robot_buffer=buffers.init_buffer(
-                LabelledSteps(observation, action, jnp.zeros((), bool)), rows
-            ),
-            waiting=PendingSteps(
-                jnp.zeros((window, spec.observation_size)),
-                jnp.zeros((window, spec.action_size)),
-                jnp.zeros((), jnp.int32),
-            ),
-        )
-
-    def act(state: EILState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return policy.apply(state.learned.actor.params, observation)
-
-    def store(state: EILState, step: Interaction, hparams: HParams) -> EILState:
-        del hparams
-        item = (step.observation[None], step.expert_action[None], step.novice_action[None])
-        robot, waiting = judge(state.robot_buffer, state.waiting, step)
-        return dataclasses.replace(
-            state,
-            human_buffer=buffers.add(state.human_buffer, item, step.takeover[None]),
-            robot_buffer=robot,
-            waiting=waiting,
-        )
-
-    def critic_loss(
-        params: Any,
-        human: Any,
-        judged: LabelledSteps,
-        weight: jax.Array,
-        others: jax.Array,
-        margin: Any,
-    ) -> tuple[jax.Array, Metrics]:
-        observation, expert_action, _ = human
-        size = (OTHERS + 1, *observation.shape)
-        good, bad, compared = hinge_losses(
-            critic.apply(params, judged.observation, judged.action),
-            judged.good,
-            critic.apply(params, observation, expert_action),
-            critic.apply(params, jnp.broadcast_to(observation, size), others),
-            jnp.sqrt(jnp.sum((others - expert_action) ** 2, -1)),
-            margin,
-        )
-        metrics = {"loss_good": good, "loss_bad": bad, "loss_compared": compared}
-        return weight * (good + bad) + compared, metrics
-
-    def actor_loss(
-        params: Any,
-        critics: Any,
-        human: Any,
-        judged: LabelledSteps,
-        weight: jax.Array,
-        hparams: HParams,
-    ) -> jax.Array:
-        observation, expert_action, _ = human
-        observation = jnp.concatenate([observation, judged.observation])
-        weight = jnp.concatenate([jnp.ones(half), weight * jnp.ones(half)])
-        action = policy.apply(params, observation)
-        value = critic.apply(critics, observation, action)[0]
-        cloned = jnp.mean(log_likelihood(action[:half], expert_action, config.likelihood))
-        return -jnp.mean(weight * value) - hparams.method.bc_weight * cloned
-
-    def update(state: EILState, key: jax.Array, hparams: HParams) -> tuple[EILState, Metrics]:
-        key_human, key_robot, key_others = jax.random.split(key, 3)
-        human = buffers.sample(state.human_buffer, key_human, half)
-        judged = buffers.sample(state.robot_buffer, key_robot, half)
-        has_human = buffers.size(state.human_buffer) > 0
-        weight = (buffers.size(state.robot_buffer) > 0).astype(jnp.float32)
-        random = jax.random.uniform(key_others, (OTHERS, *human[1].shape), minval=-1.0, maxval=1.0)
-        others = jnp.concatenate([human[2][None], random])
-
-        def loss(params: Any) -> tuple[jax.Array, Metrics]:
-            return critic_loss(params, human, judged, weight, others, hparams.method.margin)
-
-        actor, critics = state.learned.actor, state.learned.critic
-        grads, metrics = jax.grad(loss, has_aux=True)(critics.params)
-        critics = adam_step(critics, grads, hparams.learning_rate, has_human, 1.0)
-
-        def improve(actor: Any) -> Any:
-            grads = jax.grad(actor_loss)(
-                actor.params, critics.params, human, judged, weight, hparams
-            )
-            return adam_step(actor, grads, hparams.learning_rate)
-
-        turn = has_human & (critics.updates % POLICY_DELAY == 0)
-        actor = jax.lax.cond(turn, improve, lambda actor: actor, actor)
-        learned = ActorCritic(actor, critics)
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: EILState) -> Layers:
-        return layers(state.learned.actor.average)
-
+    networks = Networks(
+        policy=make_policy(spec, config.hidden), critic=make_critic(spec, config.hidden, 2)
+    )
     return Algorithm(
         name="eil",
-        init=init,
-        act=act,
+        init=functools.partial(init_state, networks=networks, spec=spec, config=config),
+        act=lambda state, key, observation: networks.policy.apply(
+            state.learned.actor.params, observation
+        ),
         store=store,
-        update=update,
-        policy=policy_layers,
+        update=functools.partial(update, networks=networks, config=config),
+        policy=lambda state: layers(state.learned.actor.average),
     )

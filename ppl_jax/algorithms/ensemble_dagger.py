@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -15,7 +16,7 @@ from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics, bc_loss
-from ppl_jax.networks import Ensemble, Layers, ensemble_layers, make_ensemble
+from ppl_jax.networks import Ensemble, ensemble_layers, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 
@@ -60,7 +61,7 @@ class Bootstrap:
 
 @flax.struct.dataclass
 class EnsembleState:
-    """What is learnt, and from what.
+    """The policies and their data.
 
     Attributes:
         learned: Policies with a leading [K] axis.
@@ -76,7 +77,7 @@ def init_bootstrap(key: jax.Array, spec: EnvSpec, config: TrainConfig) -> Bootst
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     rows = min(config.human_capacity, config.total_steps)
     copies = jax.random.poisson(key, 1.0, (rows, config.method.members)).astype(jnp.float32)
-    return Bootstrap(buffers.init_buffer(item, rows), copies)
+    return Bootstrap(buffer=buffers.init_buffer(item, rows), copies=copies)
 
 
 def add_human(human: Bootstrap, step: Interaction) -> Bootstrap:
@@ -85,12 +86,36 @@ def add_human(human: Bootstrap, step: Interaction) -> Bootstrap:
     return dataclasses.replace(human, buffer=buffers.add(human.buffer, item, step.takeover[None]))
 
 
-def clone_members(
+def members_loss(
+    params: Any,
+    observation: jax.Array,
+    action: jax.Array,
+    weight: jax.Array,
+    *,
     ensemble: Ensemble,
+    config: TrainConfig,
+) -> tuple[jax.Array, Metrics]:
+    """Sum of the members' cloning losses, each on a batch of its own.
+
+    Args:
+        params: Of the ensemble.
+        observation, action: [K, B, O], [K, B, A].
+        weight: [K, B].
+        ensemble: Of K members.
+        config: Static settings.
+    """
+    mean = ensemble.each(params, observation)
+    each, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction, weight=weight)
+    return config.method.members * each, metrics  # a member's gradient is that of it alone
+
+
+def clone_members(
     learned: Learned,
     human: Bootstrap,
     key: jax.Array,
     hparams: HParams,
+    *,
+    ensemble: Ensemble,
     config: TrainConfig,
 ) -> tuple[Learned, Metrics]:
     """One update: every member draws a batch of its own from a data set of its own.
@@ -103,13 +128,8 @@ def clone_members(
     observation, action = jax.tree.map(lambda leaf: leaf[rows], human.buffer.data)  # [K, B, ...]
     weight = jnp.take_along_axis(human.copies.T, rows, axis=1)
     weight = weight / jnp.maximum(jnp.mean(weight, -1, keepdims=True), 1e-9)
-
-    def loss(params: Any) -> tuple[jax.Array, Metrics]:
-        mean = ensemble.each(params, observation)
-        each, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction, weight)
-        return config.method.members * each, metrics  # a member's gradient is what it were alone
-
-    grads, metrics = jax.grad(loss, has_aux=True)(learned.params)
+    loss = functools.partial(members_loss, ensemble=ensemble, config=config)
+    grads, metrics = jax.grad(loss, has_aux=True)(learned.params, observation, action, weight)
     return adam_step(learned, grads, hparams.learning_rate, count > 0), metrics
 
 
@@ -118,52 +138,66 @@ def ensemble_variance(ensemble: Ensemble, params: Any, observation: jax.Array) -
     return jnp.mean(jnp.var(ensemble.members(params, observation), axis=0), -1)
 
 
+def init_state(
+    key: jax.Array, ensemble: Ensemble, spec: EnvSpec, config: TrainConfig
+) -> EnsembleState:
+    """Before the first step."""
+    key_params, key_data = jax.random.split(key)
+    return EnsembleState(
+        learned=init_learned(ensemble.init(key_params)),
+        human=init_bootstrap(key_data, spec, config),
+    )
+
+
+def decide(
+    state: EnsembleState, point: DecisionPoint, hparams: HParams, ensemble: Ensemble
+) -> jax.Array:
+    """Hand over where the ensemble is unsure or far from the expert."""
+    unsure = (
+        ensemble_variance(ensemble, state.learned.params, point.observation)
+        > hparams.method.max_ensemble_variance
+    )
+    apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
+    return unsure | (apart > hparams.method.max_discrepancy)
+
+
+def store(state: EnsembleState, step: Interaction, hparams: HParams) -> EnsembleState:
+    """Keep a step under the expert's control."""
+    del hparams
+    return dataclasses.replace(state, human=add_human(state.human, step))
+
+
+def update(
+    state: EnsembleState,
+    key: jax.Array,
+    hparams: HParams,
+    *,
+    ensemble: Ensemble,
+    config: TrainConfig,
+) -> tuple[EnsembleState, Metrics]:
+    """One step of Adam for every member."""
+    learned, metrics = clone_members(
+        state.learned, state.human, key, hparams, ensemble=ensemble, config=config
+    )
+    return dataclasses.replace(state, learned=learned), metrics
+
+
 def make_ensemble_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """Ensemble-DAgger: the novice acts where it is sure and agrees with the expert.
 
-        novice in control  iff  ensemble_variance(s) <= max_ensemble_variance  and  |a_n - a_h|^2 <= max_discrepancy
+        novice in control  iff  ensemble_variance(s) <= max_ensemble_variance
+                                and  |a_n - a_h|^2 <= max_discrepancy
 
     with a_n the ensemble's action. Only steps under the expert's control are learnt from, the
     demonstrations at the start included, and count as human data.
     """
     ensemble = make_ensemble(spec, config.hidden, config.method.members)
-
-    def init(key: jax.Array) -> EnsembleState:
-        key_params, key_data = jax.random.split(key)
-        learned = init_learned(ensemble.init(key_params))
-        return EnsembleState(learned, init_bootstrap(key_data, spec, config))
-
-    def act(state: EnsembleState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return ensemble.apply(state.learned.params, observation)
-
-    def decide(state: EnsembleState, point: DecisionPoint, hparams: HParams) -> jax.Array:
-        unsure = (
-            ensemble_variance(ensemble, state.learned.params, point.observation)
-            > hparams.method.max_ensemble_variance
-        )
-        apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
-        return unsure | (apart > hparams.method.max_discrepancy)
-
-    def store(state: EnsembleState, step: Interaction, hparams: HParams) -> EnsembleState:
-        del hparams
-        return dataclasses.replace(state, human=add_human(state.human, step))
-
-    def update(
-        state: EnsembleState, key: jax.Array, hparams: HParams
-    ) -> tuple[EnsembleState, Metrics]:
-        learned, metrics = clone_members(ensemble, state.learned, state.human, key, hparams, config)
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: EnsembleState) -> Layers:
-        return ensemble_layers(state.learned.average)
-
     return Algorithm(
         name="ensemble_dagger",
-        init=init,
-        act=act,
-        decide=decide,
+        init=functools.partial(init_state, ensemble=ensemble, spec=spec, config=config),
+        act=lambda state, key, observation: ensemble.apply(state.learned.params, observation),
+        decide=functools.partial(decide, ensemble=ensemble),
         store=store,
-        update=update,
-        policy=policy_layers,
+        update=functools.partial(update, ensemble=ensemble, config=config),
+        policy=lambda state: ensemble_layers(state.learned.average),
     )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import squashed_gaussian
 from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
-from ppl_jax.networks import Layers, layers, make_critic, make_raw
+from ppl_jax.networks import Layers, Network, layers, make_critic, make_raw
 from ppl_jax.types import EnvSpec, Interaction
 
 
@@ -36,9 +37,23 @@ class HACOHParams:
     )
 
 
+class Networks(NamedTuple):
+    """The networks, and the variant.
+
+    Attributes:
+        actor: Gives mean and log standard deviation, side by side.
+        critic: Twin action values.
+        ported: See `make_haco_port`.
+    """
+
+    actor: Network
+    critic: Network
+    ported: bool
+
+
 @flax.struct.dataclass
 class HACOLearned:
-    """What updates change.
+    """All that updates change.
 
     Attributes:
         actor: `Learned` of a squashed Gaussian: its network gives mean and log standard deviation.
@@ -55,7 +70,7 @@ class HACOLearned:
 
 @flax.struct.dataclass
 class HACOState:
-    """What is learnt, and from what."""
+    """Policy and values, and their data."""
 
     learned: HACOLearned
     replay: SplitBuffer
@@ -63,6 +78,7 @@ class HACOState:
 
 def intervention_cost(expert_action: jax.Array, novice_action: jax.Array) -> jax.Array:
     """C = 1 - cos(a_h, a_n) in [0, 2]; 0 where either is zero. [..., A] -> [...]."""
+    chex.assert_equal_shape([expert_action, novice_action])
     norms = jnp.linalg.norm(expert_action, axis=-1) * jnp.linalg.norm(novice_action, axis=-1)
     dot = jnp.sum(expert_action * novice_action, -1)
     return jnp.where(norms < 1e-6, 0.0, 1.0 - dot / jnp.maximum(norms, 1e-6))
@@ -73,10 +89,13 @@ def proxy_loss(
     novice_value: jax.Array,
     target: jax.Array,
     takeover: jax.Array,
+    *,
     weight: jax.Array,
     conservative_weight: jax.Array | float,
 ) -> jax.Array:
     """E[1/2 (Q(s, a_b) - y)^2 - c I (Q(s, a_b) - Q(s, a_n))], summed over critics [K, B]."""
+    chex.assert_equal_shape([executed_value, novice_value])
+    chex.assert_equal_shape([target, takeover, weight])
     raised = jnp.mean(weight * takeover * (executed_value - novice_value), -1)
     return 0.5 * td_loss(executed_value, target, weight) - conservative_weight * jnp.sum(raised)
 
@@ -86,10 +105,144 @@ def policy_loss(
     values: jax.Array,
     costs: jax.Array,
     alpha: jax.Array | float,
+    *,
     weight: jax.Array,
 ) -> jax.Array:
     """E[alpha log pi(a|s) - min_k Q_k(s, a) + min_k Qint_k(s, a)], [B], [K, B], [K, B]."""
+    chex.assert_equal_shape([log_pi, weight], custom_message="log_pi and weight")
+    chex.assert_shape([values, costs], (None, *log_pi.shape))
     return jnp.mean(weight * (alpha * log_pi - jnp.min(values, 0) + jnp.min(costs, 0)))
+
+
+def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig) -> HACOState:
+    """Before the first step."""
+    key_actor, key_value, key_cost = jax.random.split(key, 3)
+    learned = HACOLearned(
+        actor=init_learned(networks.actor.init(key_actor)),
+        value=init_learned(networks.critic.init(key_value)),
+        cost=init_learned(networks.critic.init(key_cost)),
+        log_alpha=init_learned(jnp.zeros(())),
+    )
+    return HACOState(learned=learned, replay=init_replay(spec, config))
+
+
+def sample_action(
+    params: Any, key: jax.Array, observation: jax.Array, actor: Network
+) -> tuple[jax.Array, jax.Array]:
+    """An action of the policy and its log-density, [..., O] -> [..., A], [...]."""
+    mean, log_std = jnp.split(actor.apply(params, observation), 2, -1)
+    return squashed_gaussian(key, mean, log_std)
+
+
+def store(state: HACOState, step: Interaction, hparams: HParams) -> HACOState:
+    """Keep a step."""
+    del hparams
+    return dataclasses.replace(state, replay=add_step(state.replay, step))
+
+
+def value_loss(
+    params: Any,
+    batch: ReplayStep,
+    target: jax.Array,
+    weight: jax.Array,
+    *,
+    conservative_weight: jax.Array | float,
+    networks: Networks,
+) -> jax.Array:
+    """L_Q of a batch with targets and weights [B]."""
+    executed = networks.critic.apply(params, batch.observation, batch.executed_action)
+    novices = networks.critic.apply(params, batch.observation, batch.novice_action)
+    return proxy_loss(
+        executed,
+        novices,
+        target,
+        batch.takeover,
+        weight=weight,
+        conservative_weight=conservative_weight,
+    )
+
+
+def cost_loss(
+    params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array, *, networks: Networks
+) -> jax.Array:
+    """L_int of a batch with targets and weights [B]."""
+    at = batch.executed_action if networks.ported else batch.novice_action
+    value = networks.critic.apply(params, batch.observation, at)
+    return 0.5 * td_loss(value, target, weight)
+
+
+def actor_loss(
+    params: Any,
+    learned: HACOLearned,
+    key: jax.Array,
+    observation: jax.Array,
+    *,
+    weight: jax.Array,
+    networks: Networks,
+) -> tuple[jax.Array, jax.Array]:
+    """L_pi at observations [B, O] with weights [B], and the mean log-density."""
+    action, log_pi = sample_action(params, key, observation, networks.actor)
+    values = networks.critic.apply(learned.value.params, observation, action)
+    costs = networks.critic.apply(learned.cost.params, observation, action)
+    alpha = jnp.exp(learned.log_alpha.params)
+    loss = policy_loss(log_pi, values, costs, alpha, weight=weight)
+    return loss, jnp.mean(weight * log_pi)
+
+
+def update(
+    state: HACOState, key: jax.Array, hparams: HParams, *, networks: Networks, config: TrainConfig
+) -> tuple[HACOState, Metrics]:
+    """One step of Adam for both values, then for the policy and the temperature."""
+    key_batch, key_next, key_actor = jax.random.split(key, 3)
+    sample = buffers.sample_both if networks.ported else buffers.sample_split
+    batch, weight = sample(state.replay, key_batch, config.batch_size)
+    has_data = buffers.size(state.replay.human) > 0
+    learned, discount = state.learned, hparams.method.discount
+    step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)
+    step_critic = functools.partial(step, polyak_tau=hparams.method.polyak_tau)
+    action, log_pi = sample_action(
+        learned.actor.params, key_next, batch.next_observation, networks.actor
+    )
+    alpha = jnp.exp(learned.log_alpha.params)
+    values = networks.critic.apply(learned.value.average, batch.next_observation, action)
+    costs = networks.critic.apply(learned.cost.average, batch.next_observation, action)
+    paid = batch.takeover if networks.ported else batch.takeover_start
+    price = paid * intervention_cost(batch.expert_action, batch.novice_action)
+    loss = functools.partial(
+        value_loss, conservative_weight=hparams.method.conservative_weight, networks=networks
+    )
+    loss_value, grads = jax.value_and_grad(loss)(
+        learned.value.params,
+        batch,
+        td_target(values, batch.terminated, discount, entropy=-alpha * log_pi),
+        weight,
+    )
+    value = step_critic(learned.value, grads)
+    loss_cost, grads = jax.value_and_grad(functools.partial(cost_loss, networks=networks))(
+        learned.cost.params,
+        batch,
+        td_target(costs, batch.terminated, discount, paid=price),
+        weight,
+    )
+    cost = step_critic(learned.cost, grads)
+    learned = dataclasses.replace(learned, value=value, cost=cost)
+    loss = functools.partial(actor_loss, weight=weight, networks=networks)
+    (loss_actor, mean_log_pi), grads = jax.value_and_grad(loss, has_aux=True)(
+        learned.actor.params, learned, key_actor, batch.observation
+    )
+    actor = step(learned.actor, grads)
+    # alpha grows while the entropy is below -A: d/d log_alpha of -log_alpha (log pi - A)
+    log_alpha = step(learned.log_alpha, -(mean_log_pi - batch.novice_action.shape[-1]))
+    learned = dataclasses.replace(learned, actor=actor, log_alpha=log_alpha)
+    metrics = {"loss_value": loss_value, "loss_cost": loss_cost, "loss_actor": loss_actor}
+    return dataclasses.replace(state, learned=learned), metrics | {"alpha": alpha}
+
+
+def mean_layers(state: HACOState) -> Layers:
+    """The layers of the policy's mean alone."""
+    *before, (w, b) = layers(state.learned.actor.average)
+    actions = b.shape[0] // 2
+    return [*before, (w[:, :actions], b[:actions])]
 
 
 def make_haco(spec: EnvSpec, config: TrainConfig) -> Algorithm:
@@ -117,112 +270,18 @@ def make_haco_port(spec: EnvSpec, config: TrainConfig) -> Algorithm:
 
 
 def _make(name: str, spec: EnvSpec, config: TrainConfig, ported: bool) -> Algorithm:
-    actions = spec.action_size
-    network = make_raw(spec, config.hidden, 2 * actions)
-    critic = make_critic(spec, config.hidden, 2)
-    sample = buffers.sample_both if ported else buffers.sample_split
-
-    def init(key: jax.Array) -> HACOState:
-        key_actor, key_value, key_cost = jax.random.split(key, 3)
-        learned = HACOLearned(
-            actor=init_learned(network.init(key_actor)),
-            value=init_learned(critic.init(key_value)),
-            cost=init_learned(critic.init(key_cost)),
-            log_alpha=init_learned(jnp.zeros(())),
-        )
-        return HACOState(learned, init_replay(spec, config))
-
-    def sample_novice_action(
-        params: Any, key: jax.Array, observation: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        mean, log_std = jnp.split(network.apply(params, observation), 2, -1)
-        return squashed_gaussian(key, mean, log_std)
-
-    def act(state: HACOState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        return sample_novice_action(state.learned.actor.params, key, observation)[0]
-
-    def store(state: HACOState, step: Interaction, hparams: HParams) -> HACOState:
-        del hparams
-        return dataclasses.replace(state, replay=add_step(state.replay, step))
-
-    def value_loss(
-        params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array, hparams: HParams
-    ) -> jax.Array:
-        executed = critic.apply(params, batch.observation, batch.executed_action)
-        novices = critic.apply(params, batch.observation, batch.novice_action)
-        return proxy_loss(
-            executed, novices, target, batch.takeover, weight, hparams.method.conservative_weight
-        )
-
-    def cost_loss(
-        params: Any, batch: ReplayStep, target: jax.Array, weight: jax.Array
-    ) -> jax.Array:
-        at = batch.executed_action if ported else batch.novice_action
-        value = critic.apply(params, batch.observation, at)
-        return 0.5 * td_loss(value, target, weight)
-
-    def actor_loss(
-        params: Any,
-        learned: HACOLearned,
-        key: jax.Array,
-        observation: jax.Array,
-        weight: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        action, log_pi = sample_novice_action(params, key, observation)
-        values = critic.apply(learned.value.params, observation, action)
-        costs = critic.apply(learned.cost.params, observation, action)
-        alpha = jnp.exp(learned.log_alpha.params)
-        return policy_loss(log_pi, values, costs, alpha, weight), jnp.mean(weight * log_pi)
-
-    def update(state: HACOState, key: jax.Array, hparams: HParams) -> tuple[HACOState, Metrics]:
-        key_batch, key_next, key_actor = jax.random.split(key, 3)
-        batch, weight = sample(state.replay, key_batch, config.batch_size)
-        has_data = buffers.size(state.replay.human) > 0
-        learned = state.learned
-        step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)
-        action, log_pi = sample_novice_action(
-            learned.actor.params, key_next, batch.next_observation
-        )
-        alpha = jnp.exp(learned.log_alpha.params)
-        values = critic.apply(learned.value.average, batch.next_observation, action)
-        costs = critic.apply(learned.cost.average, batch.next_observation, action)
-        paid = batch.takeover if ported else batch.takeover_start
-        price = paid * intervention_cost(batch.expert_action, batch.novice_action)
-        loss_value, grads = jax.value_and_grad(value_loss)(
-            learned.value.params,
-            batch,
-            td_target(values, batch.terminated, hparams.method.discount, entropy=-alpha * log_pi),
-            weight,
-            hparams,
-        )
-        value = step(learned.value, grads, polyak_tau=hparams.method.polyak_tau)
-        loss_cost, grads = jax.value_and_grad(cost_loss)(
-            learned.cost.params,
-            batch,
-            td_target(costs, batch.terminated, hparams.method.discount, paid=price),
-            weight,
-        )
-        cost = step(learned.cost, grads, polyak_tau=hparams.method.polyak_tau)
-        learned = dataclasses.replace(learned, value=value, cost=cost)
-        (loss_actor, mean_log_pi), grads = jax.value_and_grad(actor_loss, has_aux=True)(
-            learned.actor.params, learned, key_actor, batch.observation, weight
-        )
-        actor = step(learned.actor, grads)
-        # alpha grows while the entropy is below -A: d/d log_alpha of -log_alpha (log pi - A)
-        log_alpha = step(learned.log_alpha, -(mean_log_pi - actions))
-        learned = dataclasses.replace(learned, actor=actor, log_alpha=log_alpha)
-        metrics = {"loss_value": loss_value, "loss_cost": loss_cost, "loss_actor": loss_actor}
-        return dataclasses.replace(state, learned=learned), metrics | {"alpha": alpha}
-
-    def policy_layers(state: HACOState) -> Layers:
-        *before, (w, b) = layers(state.learned.actor.average)
-        return [*before, (w[:, :actions], b[:actions])]  # the mean alone
-
+    networks = Networks(
+        actor=make_raw(spec, config.hidden, 2 * spec.action_size),
+        critic=make_critic(spec, config.hidden, 2),
+        ported=ported,
+    )
     return Algorithm(
         name=name,
-        init=init,
-        act=act,
+        init=functools.partial(init_state, networks=networks, spec=spec, config=config),
+        act=lambda state, key, observation: sample_action(
+            state.learned.actor.params, key, observation, networks.actor
+        )[0],
         store=store,
-        update=update,
-        policy=policy_layers,
+        update=functools.partial(update, networks=networks, config=config),
+        policy=mean_layers,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -14,13 +15,13 @@ from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.losses import Metrics, bc_loss
-from ppl_jax.networks import Layers, layers, make_policy
+from ppl_jax.networks import Network, layers, make_policy
 from ppl_jax.types import EnvSpec, Interaction
 
 
 @flax.struct.dataclass
 class IWRState:
-    """What is learnt, and from what.
+    """The policy and its data.
 
     Attributes:
         learned: The policy.
@@ -29,6 +30,49 @@ class IWRState:
 
     learned: Learned
     steps: SplitBuffer
+
+
+def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> IWRState:
+    """Before the first step."""
+    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    rows = min(config.human_capacity, config.total_steps)
+    return IWRState(
+        learned=init_learned(policy.init(key)), steps=buffers.init_split(item, rows, rows)
+    )
+
+
+def store(state: IWRState, step: Interaction, hparams: HParams) -> IWRState:
+    """Keep a step with those of the party that was in control."""
+    del hparams
+    item = (step.observation, step.executed_action)
+    return dataclasses.replace(state, steps=buffers.add_split(state.steps, item, step.takeover))
+
+
+def weighted_loss(
+    params: Any,
+    items: tuple[jax.Array, jax.Array],
+    weight: jax.Array,
+    *,
+    policy: Network,
+    config: TrainConfig,
+) -> tuple[jax.Array, Metrics]:
+    """Cloning of executed actions [B, A] at observations [B, O], weighted by [B]."""
+    observation, action = items
+    mean = policy.apply(params, observation)
+    return bc_loss(mean, action, config.likelihood, config.bc_reduction, weight=weight)
+
+
+def update(
+    state: IWRState, key: jax.Array, hparams: HParams, *, policy: Network, config: TrainConfig
+) -> tuple[IWRState, Metrics]:
+    """One step of Adam on a balanced batch."""
+    items, weight = buffers.sample_split(state.steps, key, config.batch_size)
+    # nothing is learnt before the expert has shown anything
+    has_data = buffers.size(state.steps.human) > 0
+    loss = functools.partial(weighted_loss, policy=policy, config=config)
+    grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, items, weight)
+    learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+    return dataclasses.replace(state, learned=learned), metrics
 
 
 def make_iwr(spec: EnvSpec, config: TrainConfig) -> Algorithm:
@@ -41,42 +85,11 @@ def make_iwr(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     has learnt nothing.
     """
     policy = make_policy(spec, config.hidden)
-
-    def init(key: jax.Array) -> IWRState:
-        item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-        rows = min(config.human_capacity, config.total_steps)
-        return IWRState(init_learned(policy.init(key)), buffers.init_split(item, rows, rows))
-
-    def act(state: IWRState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return policy.apply(state.learned.params, observation)
-
-    def store(state: IWRState, step: Interaction, hparams: HParams) -> IWRState:
-        del hparams
-        item = (step.observation, step.executed_action)
-        return dataclasses.replace(state, steps=buffers.add_split(state.steps, item, step.takeover))
-
-    def loss(params: Any, items: Any, weight: jax.Array) -> tuple[jax.Array, Metrics]:
-        observation, action = items
-        mean = policy.apply(params, observation)
-        return bc_loss(mean, action, config.likelihood, config.bc_reduction, weight)
-
-    def update(state: IWRState, key: jax.Array, hparams: HParams) -> tuple[IWRState, Metrics]:
-        items, weight = buffers.sample_split(state.steps, key, config.batch_size)
-        # nothing is learnt before the expert has shown anything
-        has_data = buffers.size(state.steps.human) > 0
-        grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, items, weight)
-        learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: IWRState) -> Layers:
-        return layers(state.learned.average)
-
     return Algorithm(
         name="iwr",
-        init=init,
-        act=act,
+        init=functools.partial(init_state, policy=policy, spec=spec, config=config),
+        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
         store=store,
-        update=update,
-        policy=policy_layers,
+        update=functools.partial(update, policy=policy, config=config),
+        policy=lambda state: layers(state.learned.average),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ from ppl_jax.losses import (
     pair_likelihoods,
     preference_loss,
 )
-from ppl_jax.networks import Layers, layers, make_policy
+from ppl_jax.networks import Network, layers, make_policy
 from ppl_jax.preference import preference_pairs
 from ppl_jax.types import EnvSpec, Interaction, PreferenceBatch
 
@@ -55,7 +56,7 @@ class PPLConfig:
     )
     objective_target: Literal["pair", "library"] = setting(
         "pair",
-        "Margin of ipo and slic_hf: one that bounded actions can reach, or the libraries' constant.",
+        "Margin of ipo and slic_hf: one that bounded actions reach, or the libraries' constant.",
         choices=("pair", "library"),
     )
     preferred: Literal["expert", "random"] = setting(
@@ -141,7 +142,7 @@ def fit_horizons(
 
 @flax.struct.dataclass
 class PPLState:
-    """What is learnt and the two data sets.
+    """The policy and the two data sets.
 
     Attributes:
         learned: Parameters of the policy, its optimiser and its average.
@@ -149,7 +150,7 @@ class PPLState:
         preference_buffer: D_pref of `PreferenceBatch`.
         random_actions: [2, C, A] that stand in for preferred and rejected actions of the rows of
             `preference_buffer` in ablations; None otherwise.
-        horizon: What L is chosen from where it is chosen while training; None otherwise.
+        horizon: The measurements from which L is chosen while training; None otherwise.
     """
 
     learned: Learned
@@ -159,13 +160,189 @@ class PPLState:
     horizon: horizon.Horizon | None
 
 
+def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> PPLState:
+    """Before the first step."""
+    method, actions = config.method, None
+    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    pair = PreferenceBatch(
+        observation=observation,
+        preferred_action=action,
+        rejected_action=action,
+        rejected_observation=observation if method.pair_states == "shifted" else None,
+    )
+    if "random" in (method.preferred, method.rejected):
+        shape = (2, method.preference_capacity, spec.action_size)
+        actions = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0, maxval=1.0)
+    measured = horizon.init_horizon(method.max_preference_horizon)
+    return PPLState(
+        learned=init_learned(policy.init(key)),
+        human_buffer=buffers.init_buffer(
+            (observation, action), min(config.human_capacity, config.total_steps)
+        ),
+        preference_buffer=buffers.init_buffer(pair, method.preference_capacity),
+        random_actions=actions,
+        horizon=measured if method.adaptive_horizon else None,
+    )
+
+
+def measure_horizon(state: PPLState, step: Interaction, scale: jax.Array) -> PPLState:
+    """Take in the expert's answers at predicted states, where it was asked.
+
+    Args:
+        state: Before.
+        step: An interaction.
+        scale: [O] units of the observation.
+    """
+    predicted = step.predicted
+    if state.horizon is None or predicted.expert_actions is None:
+        return state
+    found = horizon.measure(
+        step.observation,
+        predicted.observation,
+        predicted.expert_actions,
+        expert_action=step.expert_action,
+        novice_action=step.novice_action,
+        scale=scale,
+    )
+    seen = step.takeover & predicted.valid
+    return dataclasses.replace(state, horizon=horizon.add(state.horizon, found, seen))
+
+
+def pairs_per_step(state: PPLState, hparams: HParams) -> jax.Array | float:
+    """L."""
+    if state.horizon is None:
+        return hparams.method.preference_horizon
+    return horizon.choose(state.horizon, hparams.method.preference_horizon)
+
+
+def store(
+    state: PPLState, step: Interaction, hparams: HParams, *, scale: jax.Array, method: PPLConfig
+) -> PPLState:
+    """Keep a step under the expert's control, and its preference pairs.
+
+    Args:
+        state: Before.
+        step: An interaction.
+        hparams: L.
+        scale: [O] units of the observation.
+        method: Static settings.
+    """
+    human = buffers.add(
+        state.human_buffer,
+        (step.observation[None], step.expert_action[None]),
+        step.takeover[None],
+    )
+    state = measure_horizon(state, step, scale)
+    pairs, mask = preference_pairs(step, pairs_per_step(state, hparams), method.pair_states)
+    if state.random_actions is not None:
+        rank = jnp.cumsum(mask) - 1
+        rows = (state.preference_buffer.next + rank) % method.preference_capacity
+        preferred, rejected = state.random_actions[:, rows]
+        if method.preferred == "random":
+            pairs = dataclasses.replace(pairs, preferred_action=preferred)
+        if method.rejected == "random":
+            pairs = dataclasses.replace(pairs, rejected_action=rejected)
+    return dataclasses.replace(
+        state,
+        human_buffer=human,
+        preference_buffer=buffers.add(state.preference_buffer, pairs, mask),
+    )
+
+
+def pair_actions(
+    pairs: PreferenceBatch, act: Callable[[jax.Array], jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """A policy's actions where the preferred and where the rejected action belong, [B, A] each."""
+    at_preferred = act(pairs.observation)
+    if pairs.rejected_observation is None:
+        return at_preferred, at_preferred
+    return at_preferred, act(pairs.rejected_observation)
+
+
+def ppl_loss(
+    params: Any,
+    cloned: tuple[jax.Array, jax.Array],
+    pairs: PreferenceBatch,
+    has_pairs: jax.Array,
+    *,
+    hparams: HParams,
+    policy: Network,
+    config: TrainConfig,
+    reference: Reference | None = None,
+) -> tuple[jax.Array, Metrics]:
+    """bc_weight L_bc + preference_weight L_pref of one batch from either data set.
+
+    Args:
+        params: Of the policy.
+        cloned: Observations [B, O] and expert actions [B, A].
+        pairs: [B].
+        has_pairs: 0 while there are none, else 1.
+        hparams: Weights, beta and bias.
+        policy: The network.
+        config: Likelihood, reduction and objective.
+        reference: See `make_ppl`.
+    """
+    observation, action = cloned
+    weights, method = hparams.method, config.method
+    # two separate forward passes: XLA runs them side by side on a CPU
+    bc, metrics = bc_loss(
+        policy.apply(params, observation), action, config.likelihood, config.bc_reduction
+    )
+    preferred_mean, rejected_mean = pair_actions(pairs, functools.partial(policy.apply, params))
+    compared = pair_likelihoods(
+        preferred_mean,
+        pairs.preferred_action,
+        rejected_mean,
+        pairs.rejected_action,
+        bias=weights.preference_bias,
+        likelihood=config.likelihood,
+        reference=pair_actions(pairs, reference) if reference is not None else None,
+    )
+    preference, more = preference_loss(
+        compared,
+        weights.beta,
+        weights.preference_bias,
+        objective=method.objective,
+        target=method.objective_target,
+    )
+    total = weights.bc_weight * bc + weights.preference_weight * has_pairs * preference
+    return total, metrics | more
+
+
+def update(
+    state: PPLState,
+    key: jax.Array,
+    hparams: HParams,
+    *,
+    policy: Network,
+    config: TrainConfig,
+    reference: Reference | None = None,
+) -> tuple[PPLState, Metrics]:
+    """One step of Adam on a batch from either data set."""
+    key_human, key_pairs = jax.random.split(key)
+    cloned = buffers.sample(state.human_buffer, key_human, config.batch_size)
+    pairs = buffers.sample(state.preference_buffer, key_pairs, config.batch_size)
+    has_data = buffers.size(state.human_buffer) > 0
+    has_pairs = buffers.size(state.preference_buffer) > 0
+    loss = functools.partial(
+        ppl_loss, hparams=hparams, policy=policy, config=config, reference=reference
+    )
+    grads, metrics = jax.grad(loss, has_aux=True)(
+        state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32)
+    )
+    learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+    if state.horizon is not None:
+        metrics = metrics | {"preference_horizon": pairs_per_step(state, hparams)}
+    return dataclasses.replace(state, learned=learned), metrics
+
+
 def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = None) -> Algorithm:
     """PPL: clone the expert, and prefer its action on the states the novice would have come to.
 
         L = preference_weight L_pref + bc_weight L_bc                    (see `ppl_jax.losses`)
 
     Args:
-        spec: Of the world.
+        spec: Of the environment.
         config: Static settings; `objective`, `preferred`, `rejected` and `pair_states` make the
             ablations.
         reference: Reference policy of the objectives that have one.
@@ -173,144 +350,17 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
     Raises:
         ValueError: If the objective needs a reference and none is given.
     """
-    if config.method.objective in NEEDS_REFERENCE and reference is None:
-        raise ValueError(f"objective {config.method.objective!r} needs a reference policy")
+    method = config.method
+    if method.objective in NEEDS_REFERENCE and reference is None:
+        raise ValueError(f"objective {method.objective!r} needs a reference policy")
     policy = make_policy(spec, config.hidden)
-    shifted = config.method.pair_states == "shifted"
-    random = "random" in (config.method.preferred, config.method.rejected)
-    adaptive = config.method.adaptive_horizon
-
-    def init(key: jax.Array) -> PPLState:
-        observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
-        pair = PreferenceBatch(observation, action, action, observation if shifted else None)
-        rows, actions = config.method.preference_capacity, None
-        if random:
-            shape = (2, rows, spec.action_size)
-            actions = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0, maxval=1.0)
-        return PPLState(
-            learned=init_learned(policy.init(key)),
-            human_buffer=buffers.init_buffer(
-                (observation, action), min(config.human_capacity, config.total_steps)
-            ),
-            preference_buffer=buffers.init_buffer(pair, rows),
-            random_actions=actions,
-            horizon=horizon.init_horizon(config.method.max_preference_horizon)
-            if adaptive
-            else None,
-        )
-
-    def act(state: PPLState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return policy.apply(state.learned.params, observation)
-
-    def watch(state: PPLState, step: Interaction) -> PPLState:
-        """What the expert would do at the predicted states, where it was asked."""
-        predicted = step.predicted
-        if state.horizon is None or predicted.expert_actions is None:
-            return state
-        found = horizon.measure(
-            step.observation,
-            predicted.observation,
-            predicted.expert_actions,
-            step.expert_action,
-            step.novice_action,
-            jnp.asarray(spec.observation_scale),
-        )
-        seen = step.takeover & predicted.valid
-        return dataclasses.replace(state, horizon=horizon.add(state.horizon, found, seen))
-
-    def pairs_per_step(state: PPLState, hparams: HParams) -> jax.Array | float:
-        """L."""
-        if state.horizon is None:
-            return hparams.method.preference_horizon
-        return horizon.choose(state.horizon, hparams.method.preference_horizon)
-
-    def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
-        human = buffers.add(
-            state.human_buffer,
-            (step.observation[None], step.expert_action[None]),
-            step.takeover[None],
-        )
-        state = watch(state, step)
-        pairs, mask = preference_pairs(
-            step, pairs_per_step(state, hparams), config.method.pair_states
-        )
-        if state.random_actions is not None:
-            rank = jnp.cumsum(mask) - 1
-            rows = (state.preference_buffer.next + rank) % config.method.preference_capacity
-            preferred, rejected = state.random_actions[:, rows]
-            if config.method.preferred == "random":
-                pairs = dataclasses.replace(pairs, preferred_action=preferred)
-            if config.method.rejected == "random":
-                pairs = dataclasses.replace(pairs, rejected_action=rejected)
-        return dataclasses.replace(
-            state,
-            human_buffer=human,
-            preference_buffer=buffers.add(state.preference_buffer, pairs, mask),
-        )
-
-    def loss(
-        params: Any, cloned: Any, pairs: PreferenceBatch, has_pairs: jax.Array, hparams: HParams
-    ) -> tuple[jax.Array, Metrics]:
-        observation, action = cloned
-        # two separate forward passes: XLA runs them side by side on a CPU
-        bc, metrics = bc_loss(
-            policy.apply(params, observation), action, config.likelihood, config.bc_reduction
-        )
-
-        def means(apply: Callable[[jax.Array], jax.Array]) -> tuple[jax.Array, jax.Array]:
-            at_preferred = apply(pairs.observation)
-            if pairs.rejected_observation is None:
-                return at_preferred, at_preferred
-            return at_preferred, apply(pairs.rejected_observation)
-
-        preferred_mean, rejected_mean = means(lambda observation: policy.apply(params, observation))
-        compared = pair_likelihoods(
-            preferred_mean,
-            pairs.preferred_action,
-            rejected_mean,
-            pairs.rejected_action,
-            hparams.method.preference_bias,
-            config.likelihood,
-            means(reference) if reference is not None else None,
-        )
-        preference, more = preference_loss(
-            compared,
-            hparams.method.beta,
-            hparams.method.preference_bias,
-            config.method.objective,
-            config.method.objective_target,
-        )
-        total = (
-            hparams.method.bc_weight * bc
-            + hparams.method.preference_weight * has_pairs * preference
-        )
-        return total, metrics | more
-
-    def update(state: PPLState, key: jax.Array, hparams: HParams) -> tuple[PPLState, Metrics]:
-        key_human, key_pairs = jax.random.split(key)
-        cloned = buffers.sample(state.human_buffer, key_human, config.batch_size)
-        pairs = buffers.sample(state.preference_buffer, key_pairs, config.batch_size)
-        has_data = buffers.size(state.human_buffer) > 0
-        has_pairs = buffers.size(state.preference_buffer) > 0
-        grads, metrics = jax.grad(loss, has_aux=True)(
-            state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32), hparams
-        )
-        learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
-        if adaptive:
-            metrics = metrics | {"preference_horizon": pairs_per_step(state, hparams)}
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: PPLState) -> Layers:
-        return layers(state.learned.average)
-
     return Algorithm(
         name="ppl",
-        init=init,
-        act=act,
-        store=store,
-        update=update,
-        policy=policy_layers,
-        predicted_steps=config.method.max_preference_horizon,
-        labels_predictions=adaptive,
+        init=functools.partial(init_state, policy=policy, spec=spec, config=config),
+        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
+        store=functools.partial(store, scale=jnp.asarray(spec.observation_scale), method=method),
+        update=functools.partial(update, policy=policy, config=config, reference=reference),
+        policy=lambda state: layers(state.learned.average),
+        predicted_steps=method.max_preference_horizon,
+        labels_predictions=method.adaptive_horizon,
     )

@@ -1,7 +1,8 @@
-"""What methods with action values store of a step."""
+"""Steps as methods with action values store them, and the losses of these values."""
 
 from __future__ import annotations
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,7 @@ def td_target(
     next_values: jax.Array,
     terminated: jax.Array,
     discount: jax.Array | float,
+    *,
     paid: jax.Array | float = 0.0,
     entropy: jax.Array | float = 0.0,
 ) -> jax.Array:
@@ -47,11 +49,16 @@ def td_target(
         paid: Reward or cost of the step, [B]; there is no reward here.
         entropy: -alpha log pi(a'|s'), [B], of methods that have one.
     """
+    chex.assert_shape(next_values, (None, *terminated.shape))
+    for each in (paid, entropy):
+        chex.assert_is_broadcastable(jnp.shape(each), terminated.shape)
     return paid + discount * (1.0 - terminated) * (jnp.min(next_values, 0) + entropy)
 
 
 def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
     """E[(Q(s, a) - y)^2], summed over critics [K, B]; `target` [B] gets no gradient."""
+    chex.assert_equal_shape([target, weight], custom_message="target and weight")
+    chex.assert_shape(value, (None, *target.shape))
     return jnp.sum(jnp.mean(weight * (value - jax.lax.stop_gradient(target)) ** 2, -1))
 
 
@@ -59,13 +66,22 @@ def init_replay(spec: EnvSpec, config: TrainConfig) -> SplitBuffer:
     """Empty buffers of the expert's and the novice's steps."""
     observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
     no = jnp.zeros((), bool)
-    item = ReplayStep(observation, observation, action, action, action, no, no, no)
+    item = ReplayStep(
+        observation=observation,
+        next_observation=observation,
+        novice_action=action,
+        expert_action=action,
+        executed_action=action,
+        takeover=no,
+        takeover_start=no,
+        terminated=no,
+    )
     rows = min(config.human_capacity, config.total_steps)
     return buffers.init_split(item, rows, rows)
 
 
 def add_step(replay: SplitBuffer, step: Interaction) -> SplitBuffer:
-    """Store a step with whoever was in control."""
+    """Store a step with those of the party that was in control."""
     item = ReplayStep(
         observation=step.observation,
         next_observation=step.next_observation,

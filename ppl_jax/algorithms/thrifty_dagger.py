@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
-from ppl_jax.networks import Layers, ensemble_layers, make_critic, make_ensemble
+from ppl_jax.networks import Ensemble, Network, ensemble_layers, make_critic, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 RISK_DISCOUNT = 0.9999  # of the probability of success
@@ -48,9 +50,21 @@ class ThriftyDAggerHParams:
     polyak_tau: jax.Array | float = setting(0.005, "tau of the target networks.", low=0, high=1)
 
 
+class Networks(NamedTuple):
+    """The networks.
+
+    Attributes:
+        ensemble: Policies.
+        critic: Twin logits of the probability of success.
+    """
+
+    ensemble: Ensemble
+    critic: Network
+
+
 @flax.struct.dataclass
 class RiskStep:
-    """What the estimate of success learns from."""
+    """A step from which the estimate of success learns."""
 
     observation: jax.Array
     action: jax.Array
@@ -61,7 +75,7 @@ class RiskStep:
 
 @flax.struct.dataclass
 class ThriftyLearned:
-    """What updates change.
+    """All that updates change.
 
     Attributes:
         policies: `Learned` of the ensemble.
@@ -77,7 +91,7 @@ class ThriftyLearned:
 
 @flax.struct.dataclass
 class ThriftyState:
-    """What is learnt, and from what.
+    """The policies, the estimate of success and their data.
 
     Attributes:
         learned: `ThriftyLearned`.
@@ -103,7 +117,163 @@ def quantile(buffer: RingBuffer, values: jax.Array, share: jax.Array | float) ->
 
 def risk_target(success: jax.Array, terminated: jax.Array, following: jax.Array) -> jax.Array:
     """Probability of success: 1 where solved, else gamma (1 - terminated) times the next one's."""
+    chex.assert_equal_shape([success, terminated, following])
     return jnp.where(success, 1.0, RISK_DISCOUNT * (1.0 - terminated) * following)
+
+
+def risk_loss(params: Any, batch: RiskStep, target: jax.Array, critic: Network) -> jax.Array:
+    """E[(Q(s, a) - y)^2] of both estimates of success; `target` is [B]."""
+    value = jax.nn.sigmoid(critic.apply(params, batch.observation, batch.action))
+    chex.assert_shape(value, (None, *target.shape))
+    return jnp.mean((value - target) ** 2)
+
+
+def safety(params: Any, observation: jax.Array, action: jax.Array, critic: Network) -> jax.Array:
+    """Estimated probability of success, the smaller of two, [..., O], [..., A] -> [...]."""
+    return jnp.min(jax.nn.sigmoid(critic.apply(params, observation, action)), 0)
+
+
+def init_state(
+    key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig
+) -> ThriftyState:
+    """Before the first step."""
+    key_params, key_risk, key_data = jax.random.split(key, 3)
+    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    no = jnp.zeros((), bool)
+    item = RiskStep(
+        observation=observation,
+        action=action,
+        next_observation=observation,
+        terminated=no,
+        success=no,
+    )
+    return ThriftyState(
+        learned=ThriftyLearned(
+            policies=init_learned(networks.ensemble.init(key_params)),
+            risk=init_learned(networks.critic.init(key_risk)),
+            discrepancy=jnp.zeros(()),
+        ),
+        human=init_bootstrap(key_data, spec, config),
+        steps=buffers.init_buffer(item, min(config.human_capacity, config.total_steps)),
+        goals=buffers.init_buffer(item, GOALS),
+        recent=buffers.init_buffer((jnp.zeros(()), jnp.zeros(())), RECENT),
+    )
+
+
+def decide(
+    state: ThriftyState, point: DecisionPoint, hparams: HParams, networks: Networks
+) -> jax.Array:
+    """The two tests of `make_thrifty_dagger`."""
+    policies, recent = state.learned.policies.params, state.recent
+    held = buffers.size(recent)
+    doubts, safeties = recent.data
+    shown = state.human.buffer
+    rows = jnp.arange(SAMPLE) % jnp.maximum(buffers.size(shown), 1)
+    at_first = jnp.quantile(
+        ensemble_variance(networks.ensemble, policies, shown.data[0][rows]),
+        1.0 - hparams.method.switch_rate,
+    )
+    few = held < ENOUGH
+    novel = jnp.where(few, at_first, quantile(recent, doubts, 1.0 - hparams.method.switch_rate))
+    unsafe = jnp.where(few, UNSAFE, quantile(recent, safeties, hparams.method.switch_rate))
+    safe = jnp.where(few, SAFE, quantile(recent, safeties, 0.5))
+    risk = state.learned.risk.params
+    now = safety(risk, point.observation, point.novice_action, networks.critic)
+    doubt = ensemble_variance(networks.ensemble, policies, point.observation)
+    ask = (doubt > novel) | (now < unsafe)
+    apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
+    hand_back = (apart < state.learned.discrepancy) & (now > safe)
+    return jnp.where(point.takeover, ~hand_back, ask)
+
+
+def store(
+    state: ThriftyState, step: Interaction, hparams: HParams, networks: Networks
+) -> ThriftyState:
+    """Keep a step for the estimate of success, and for cloning or the thresholds."""
+    del hparams
+    item = RiskStep(
+        observation=step.observation,
+        action=step.executed_action,
+        next_observation=step.next_observation,
+        terminated=step.terminated,
+        success=step.success,
+    )
+    row = jax.tree.map(lambda leaf: leaf[None], item)
+    policies, risk = state.learned.policies.params, state.learned.risk.params
+    seen = (
+        ensemble_variance(networks.ensemble, policies, step.observation)[None],
+        safety(risk, step.observation, step.novice_action, networks.critic)[None],
+    )
+    return dataclasses.replace(
+        state,
+        human=add_human(state.human, step),
+        steps=buffers.add(state.steps, row, jnp.ones(1, bool)),
+        goals=buffers.add(state.goals, row, step.success[None]),
+        recent=buffers.add(state.recent, seen, ~step.takeover[None]),
+    )
+
+
+def sample_steps(state: ThriftyState, key: jax.Array, key_goals: jax.Array, count: int) -> RiskStep:
+    """A batch [count] with a share of steps that solved the task, once there are any."""
+    batch = buffers.sample(state.steps, key, count)
+    goals = buffers.sample(state.goals, key_goals, count)
+    is_goal = (jnp.arange(count) < GOAL_SHARE * count) & (buffers.size(state.goals) > 0)
+    return jax.tree.map(
+        lambda goal, step: jnp.where(is_goal.reshape(-1, *[1] * (goal.ndim - 1)), goal, step),
+        goals,
+        batch,
+    )
+
+
+def update(
+    state: ThriftyState,
+    key: jax.Array,
+    hparams: HParams,
+    *,
+    networks: Networks,
+    config: TrainConfig,
+) -> tuple[ThriftyState, Metrics]:
+    """One step of Adam for policies and estimates of success."""
+    key_clone, key_steps, key_goals = jax.random.split(key, 3)
+    ensemble, critic = networks
+    learned = state.learned
+    policies, metrics = clone_members(
+        learned.policies, state.human, key_clone, hparams, ensemble=ensemble, config=config
+    )
+    batch = sample_steps(state, key_steps, key_goals, config.batch_size)
+    action = ensemble.apply(learned.policies.params, batch.next_observation)
+    following = safety(learned.risk.average, batch.next_observation, action, critic)
+    target = risk_target(batch.success, batch.terminated, following)
+    loss, grads = jax.value_and_grad(risk_loss)(learned.risk.params, batch, target, critic)
+    risk = adam_step(
+        learned.risk,
+        grads,
+        hparams.learning_rate,
+        buffers.size(state.steps) > 0,
+        polyak_tau=hparams.method.polyak_tau,
+    )
+    learned = dataclasses.replace(learned, policies=policies, risk=risk)
+    return dataclasses.replace(state, learned=learned), metrics | {"loss_risk": loss}
+
+
+def fit(
+    state: ThriftyState,
+    key: jax.Array,
+    hparams: HParams,
+    *,
+    networks: Networks,
+    config: TrainConfig,
+) -> tuple[ThriftyState, Metrics]:
+    """An update on demonstrations that keeps their mean discrepancy, too."""
+    state, metrics = update(state, key, hparams, networks=networks, config=config)
+    observation, action = buffers.sample(state.human.buffer, key, config.batch_size)
+    mean = networks.ensemble.apply(state.learned.policies.params, observation)
+    apart = jnp.mean(jnp.sum((mean - action) ** 2, -1))
+    # averaged over the last hundred or so updates
+    first = state.learned.policies.updates <= 1
+    kept = jnp.where(first, apart, 0.99 * state.learned.discrepancy + 0.01 * apart)
+    learned = dataclasses.replace(state.learned, discrepancy=kept)
+    return dataclasses.replace(state, learned=learned), metrics
 
 
 def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
@@ -112,141 +282,27 @@ def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         to the expert:  ensemble_variance(s) > delta_h  or  Q(s, a_n) < beta_h
         back:           |a_n - a_h|^2 < delta_r  and  Q(s, a_n) > beta_r
 
-    ensemble_variance is the variance of the ensemble, Q the estimated probability of success (the smaller of
-    two). delta_h is the (1 - alpha) quantile of the ensemble_variance and beta_h the alpha quantile of Q over
-    the novice's recent steps (alpha = `switch_rate`), beta_r the median of Q, delta_r the mean
-    discrepancy on the demonstrations. Q learns from every step and from whether the task was
-    solved, which no other method here gets to know.
+    Q is the estimated probability of success (the smaller of two). delta_h is the (1 - alpha)
+    quantile of the ensemble's variance and beta_h the alpha quantile of Q over the novice's recent
+    steps (alpha = `switch_rate`), beta_r the median of Q, delta_r the mean discrepancy on the
+    demonstrations. Q learns from every step and from whether the task was solved, which no other
+    method here gets to know.
 
     Updated at every step, as all methods here are, where the published code retrains from scratch
     after every 2000 steps (and forgets to do so with the target networks).
     """
     ensemble = make_ensemble(spec, config.hidden, config.method.members)
-    critic = make_critic(spec, config.hidden, 2)
-
-    def safety(params: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
-        return jnp.min(jax.nn.sigmoid(critic.apply(params, observation, action)), 0)
-
-    def init(key: jax.Array) -> ThriftyState:
-        key_params, key_risk, key_data = jax.random.split(key, 3)
-        observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
-        no = jnp.zeros((), bool)
-        item = RiskStep(observation, action, observation, no, no)
-        return ThriftyState(
-            learned=ThriftyLearned(
-                init_learned(ensemble.init(key_params)),
-                init_learned(critic.init(key_risk)),
-                jnp.zeros(()),
-            ),
-            human=init_bootstrap(key_data, spec, config),
-            steps=buffers.init_buffer(item, min(config.human_capacity, config.total_steps)),
-            goals=buffers.init_buffer(item, GOALS),
-            recent=buffers.init_buffer((jnp.zeros(()), jnp.zeros(())), RECENT),
-        )
-
-    def act(state: ThriftyState, key: jax.Array, observation: jax.Array) -> jax.Array:
-        del key
-        return ensemble.apply(state.learned.policies.params, observation)
-
-    def decide(state: ThriftyState, point: DecisionPoint, hparams: HParams) -> jax.Array:
-        policies, recent = state.learned.policies.params, state.recent
-        held = buffers.size(recent)
-        doubts, safeties = recent.data
-        shown = state.human.buffer
-        rows = jnp.arange(SAMPLE) % jnp.maximum(buffers.size(shown), 1)
-        at_first = jnp.quantile(
-            ensemble_variance(ensemble, policies, shown.data[0][rows]),
-            1.0 - hparams.method.switch_rate,
-        )
-        few = held < ENOUGH
-        novel = jnp.where(few, at_first, quantile(recent, doubts, 1.0 - hparams.method.switch_rate))
-        unsafe = jnp.where(few, UNSAFE, quantile(recent, safeties, hparams.method.switch_rate))
-        safe = jnp.where(few, SAFE, quantile(recent, safeties, 0.5))
-        now = safety(state.learned.risk.params, point.observation, point.novice_action)
-        ask = (ensemble_variance(ensemble, policies, point.observation) > novel) | (now < unsafe)
-        apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
-        hand_back = (apart < state.learned.discrepancy) & (now > safe)
-        return jnp.where(point.takeover, ~hand_back, ask)
-
-    def store(state: ThriftyState, step: Interaction, hparams: HParams) -> ThriftyState:
-        del hparams
-        item = RiskStep(
-            step.observation,
-            step.executed_action,
-            step.next_observation,
-            step.terminated,
-            step.success,
-        )
-        row = jax.tree.map(lambda leaf: leaf[None], item)
-        seen = (
-            ensemble_variance(ensemble, state.learned.policies.params, step.observation)[None],
-            safety(state.learned.risk.params, step.observation, step.novice_action)[None],
-        )
-        return dataclasses.replace(
-            state,
-            human=add_human(state.human, step),
-            steps=buffers.add(state.steps, row, jnp.ones(1, bool)),
-            goals=buffers.add(state.goals, row, step.success[None]),
-            recent=buffers.add(state.recent, seen, ~step.takeover[None]),
-        )
-
-    def risk_loss(params: Any, batch: RiskStep, target: jax.Array) -> jax.Array:
-        value = jax.nn.sigmoid(critic.apply(params, batch.observation, batch.action))
-        return jnp.mean((value - target) ** 2)
-
-    def update(
-        state: ThriftyState, key: jax.Array, hparams: HParams
-    ) -> tuple[ThriftyState, Metrics]:
-        key_clone, key_steps, key_goals = jax.random.split(key, 3)
-        learned = state.learned
-        policies, metrics = clone_members(
-            ensemble, learned.policies, state.human, key_clone, hparams, config
-        )
-        batch = buffers.sample(state.steps, key_steps, config.batch_size)
-        goals = buffers.sample(state.goals, key_goals, config.batch_size)
-        is_goal = (jnp.arange(config.batch_size) < GOAL_SHARE * config.batch_size) & (
-            buffers.size(state.goals) > 0
-        )
-        batch = jax.tree.map(
-            lambda goal, step: jnp.where(is_goal.reshape(-1, *[1] * (goal.ndim - 1)), goal, step),
-            goals,
-            batch,
-        )
-        action = ensemble.apply(learned.policies.params, batch.next_observation)
-        following = safety(learned.risk.average, batch.next_observation, action)
-        target = risk_target(batch.success, batch.terminated, following)
-        loss, grads = jax.value_and_grad(risk_loss)(learned.risk.params, batch, target)
-        risk = adam_step(
-            learned.risk,
-            grads,
-            hparams.learning_rate,
-            buffers.size(state.steps) > 0,
-            hparams.method.polyak_tau,
-        )
-        learned = dataclasses.replace(learned, policies=policies, risk=risk)
-        return dataclasses.replace(state, learned=learned), metrics | {"loss_risk": loss}
-
-    def fit(state: ThriftyState, key: jax.Array, hparams: HParams) -> tuple[ThriftyState, Metrics]:
-        state, metrics = update(state, key, hparams)
-        observation, action = buffers.sample(state.human.buffer, key, config.batch_size)
-        mean = ensemble.apply(state.learned.policies.params, observation)
-        apart = jnp.mean(jnp.sum((mean - action) ** 2, -1))
-        # averaged over the last hundred or so updates
-        first = state.learned.policies.updates <= 1
-        kept = jnp.where(first, apart, 0.99 * state.learned.discrepancy + 0.01 * apart)
-        learned = dataclasses.replace(state.learned, discrepancy=kept)
-        return dataclasses.replace(state, learned=learned), metrics
-
-    def policy_layers(state: ThriftyState) -> Layers:
-        return ensemble_layers(state.learned.policies.average)
-
+    networks = Networks(ensemble=ensemble, critic=make_critic(spec, config.hidden, 2))
+    parts = {"networks": networks, "config": config}
     return Algorithm(
         name="thrifty_dagger",
-        init=init,
-        act=act,
-        decide=decide,
-        store=store,
-        update=update,
-        policy=policy_layers,
-        fit=fit,
+        init=functools.partial(init_state, spec=spec, **parts),
+        act=lambda state, key, observation: ensemble.apply(
+            state.learned.policies.params, observation
+        ),
+        decide=functools.partial(decide, networks=networks),
+        store=functools.partial(store, networks=networks),
+        update=functools.partial(update, **parts),
+        policy=lambda state: ensemble_layers(state.learned.policies.average),
+        fit=functools.partial(fit, **parts),
     )

@@ -70,7 +70,7 @@ def test_proxy_value_loss():
 def test_td_target_and_loss():
     following, terminated = uniform(K, B), coins(B)
     paid, entropy = uniform(B), uniform(B)
-    target = replay.td_target(following, terminated, 0.9, paid, entropy)
+    target = replay.td_target(following, terminated, 0.9, paid=paid, entropy=entropy)
     value, weight = uniform(K, B), np.abs(uniform(B))
     expected = 0.0
     for b in range(B):
@@ -88,7 +88,7 @@ def test_td_target_and_loss():
 def test_pvp_policy_loss():
     value, log_pi, mask, weight = uniform(B), uniform(B), coins(B), np.abs(uniform(B))
     expected = sum(-weight[b] * (value[b] + 0.7 * mask[b] * log_pi[b]) / B for b in range(B))
-    assert float(pvp.policy_loss(value, log_pi, mask, weight, 0.7)) == pytest.approx(
+    assert float(pvp.policy_loss(value, log_pi, mask, weight, bc_weight=0.7)) == pytest.approx(
         expected, rel=1e-5
     )
 
@@ -102,14 +102,14 @@ def test_haco_losses():
             each = 0.5 * (executed[k, b] - target[b]) ** 2
             each -= 10.0 * mask[b] * (executed[k, b] - novices[k, b])
             expected += weight[b] * each / B
-    loss = haco.proxy_loss(executed, novices, target, mask, weight, 10.0)
+    loss = haco.proxy_loss(executed, novices, target, mask, weight=weight, conservative_weight=10.0)
     assert float(loss) == pytest.approx(expected, rel=1e-4)
     log_pi, costs = uniform(B), uniform(K, B)
     expected = sum(
         weight[b] * (0.3 * log_pi[b] - executed[:, b].min() + costs[:, b].min()) / B
         for b in range(B)
     )
-    assert float(haco.policy_loss(log_pi, executed, costs, 0.3, weight)) == pytest.approx(
+    assert float(haco.policy_loss(log_pi, executed, costs, 0.3, weight=weight)) == pytest.approx(
         expected, rel=1e-4
     )
     a, b = uniform(B, A), uniform(B, A)
@@ -151,11 +151,15 @@ def test_eil_hinges():
                 gap = ours[k, b] - others[k, n, b]
                 expected[2] += max(0, m * distance[n, b] - gap) / (4 * B)
     np.testing.assert_allclose(
-        eil.hinge_losses(value, good, ours, others, distance, m), expected, rtol=1e-5
+        eil.hinge_losses(value, good, ours, others, distance=distance, margin=m),
+        expected,
+        rtol=1e-5,
     )
     # without a margin, knowing nothing costs nothing
     zero = np.zeros_like
-    nothing = eil.hinge_losses(zero(value), good, zero(ours), zero(others), distance, 0.0)
+    nothing = eil.hinge_losses(
+        zero(value), good, zero(ours), zero(others), distance=distance, margin=0.0
+    )
     assert sum(map(float, nothing)) == 0.0
 
 

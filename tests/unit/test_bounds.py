@@ -18,8 +18,17 @@ def case(key, horizon, beta, sharpness, quality):
     other = bounds.random_policy(keys[2], S, A, sharpness)
     novice = quality * expert + (1 - quality) * other
     taken_over = jax.random.dirichlet(keys[3], jnp.ones(S))
-    pairs = bounds.preference_pairs(mdp, expert, novice, taken_over, horizon, L)
-    return mdp, expert, novice, taken_over, pairs, bounds.bound(mdp, expert, novice, pairs, beta)
+    pairs = bounds.preference_pairs(
+        mdp, expert, novice, taken_over, preference_horizon=horizon, max_horizon=L
+    )
+    return (
+        mdp,
+        expert,
+        novice,
+        taken_over,
+        pairs,
+        bounds.bound(mdp, expert, novice, pairs, beta=beta),
+    )
 
 
 many = jax.jit(jax.vmap(lambda *at: case(*at)[-1]))
@@ -107,3 +116,21 @@ def test_the_parts_against_loops():
         return total
 
     assert float(found.epsilon) == pytest.approx(loss(n) - loss(h), abs=1e-5)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    mdp = bounds.random_mdp(jax.random.key(0), S, A)
+    policy = bounds.random_policy(jax.random.key(1), S, A)
+    pairs = jnp.ones((S, A, A)) / (S * A * A)
+    for call in (
+        lambda: bounds.action_values(mdp, policy.T),
+        lambda: bounds.occupancy(mdp, policy[0]),
+        lambda: bounds.total_variation(policy, policy[0]),
+        lambda: bounds.preference_loss(pairs[:, 0], policy, 0.1),
+        lambda: bounds.bound(mdp, policy, policy[:, :1], pairs, beta=0.1),
+        lambda: bounds.preference_pairs(
+            mdp, policy, policy, policy, preference_horizon=1, max_horizon=L
+        ),
+    ):
+        with pytest.raises(AssertionError, match="shape"):
+            call()

@@ -3,6 +3,7 @@ from collections import deque
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -60,3 +61,14 @@ def test_written_in_place_inside_a_scan():
     text = run.lower(buffer, jnp.arange(10.0)).compile().as_text()
     copies = [line for line in text.splitlines() if f"[{rows},16]" in line and " copy(" in line]
     assert not copies, copies
+
+
+def test_a_mask_of_another_length_is_refused():
+    buffer = buffers.init_buffer((jnp.zeros(2), jnp.zeros(())), 7)
+    for items, mask in (
+        ((np.zeros((4, 2)), np.zeros(4)), np.ones(3, bool)),
+        ((np.zeros((4, 2)), np.zeros(3)), np.ones(4, bool)),
+        ((np.zeros((4, 2)), np.zeros(4)), np.ones((4, 1), bool)),
+    ):
+        with pytest.raises(AssertionError, match=r"shape|rank"):
+            buffers.add(buffer, items, mask)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from ppl_jax import horizon
 from ppl_jax.training import make_train
@@ -18,7 +19,14 @@ def test_measurements_against_a_loop():
         RNG.normal(size=2),
         RNG.normal(size=2),
     )
-    found = horizon.measure(here, ahead, expert_actions, preferred, rejected, scale)
+    found = horizon.measure(
+        here,
+        ahead,
+        expert_actions,
+        expert_action=preferred,
+        novice_action=rejected,
+        scale=scale,
+    )
     for i in range(5):
         drift = np.sqrt(((expert_actions[i] - preferred) ** 2).sum())
         other = np.sqrt(((expert_actions[i] - rejected) ** 2).sum())
@@ -51,7 +59,9 @@ def test_moving_means_are_means_of_what_was_seen():
     drift, valid = RNG.random((20, 3)), RNG.random((20, 3)) < 0.6
     valid[:, 0] = True
     for row, seen in zip(drift, valid, strict=True):
-        measured = horizon.Measured(jnp.zeros(3), jnp.asarray(row), jnp.ones(3), jnp.float32(0.5))
+        measured = horizon.Measured(
+            wrong=jnp.zeros(3), drift=jnp.asarray(row), reach=jnp.ones(3), apart=jnp.float32(0.5)
+        )
         state = horizon.add(state, measured, jnp.asarray(seen))
     for i in range(3):
         np.testing.assert_allclose(state.drift[i], drift[valid[:, i], i].mean(), rtol=1e-5)
@@ -63,7 +73,8 @@ def test_the_choice_balances_both_errors():
     steps = jnp.arange(1.0, 11.0)
 
     def chosen(drift, most=10):
-        return int(horizon.choose(horizon.Horizon(steps, drift, steps, jnp.float32(1.0)), most))
+        seen = horizon.Horizon(count=steps, drift=drift, reach=steps, apart=jnp.float32(1.0))
+        return int(horizon.choose(seen, most))
 
     assert chosen(0.0 * steps) == 10  # the expert says the same everywhere
     assert chosen(0.0 * steps, 6) == 6  # never above the bound
@@ -76,11 +87,15 @@ def test_the_choice_balances_both_errors():
 def test_it_is_chosen_while_training():
     """Here the expert says the same everywhere: every label is right, so L is the most."""
     config, hparams = probe_settings(
-        "ppl", adaptive_horizon=True, max_preference_horizon=6, total_steps=400
+        "ppl",
+        adaptive_horizon=True,
+        max_preference_horizon=6,
+        preference_horizon=6,
+        total_steps=400,
     )
     functions = make_train(Probe(), Probe.scripted_expert, make(), config)
     run = jax.jit(functions.run_chunk, static_argnums=1)
-    learner = functions.init(jax.random.key(0), hparams.replace(preference_horizon=6))
+    learner = functions.init(jax.random.key(0), hparams)
     learner, metrics = run(learner, 40)
     assert int(learner.counters.human_data) > 0
     assert float(jnp.max(learner.algorithm.horizon.drift)) < 1e-6
@@ -97,7 +112,9 @@ def make():
 def test_a_profile_of_a_world_that_is_known():
     """The expert says the same at every predicted state of an episode: nothing drifts."""
     config, hparams = probe_settings("ppl", max_preference_horizon=6)
-    profile = horizon.make_profile(Probe(), Probe.scripted_expert, config, 4, 60, 50, 20)
+    profile = horizon.make_profile(
+        Probe(), Probe.scripted_expert, config, worlds=4, steps=60, visited=50, kept=20
+    )
     found = jax.jit(lambda key: profile(key, lambda observation: jnp.zeros(1), hparams))(
         jax.random.key(0)
     )
@@ -107,3 +124,21 @@ def test_a_profile_of_a_world_that_is_known():
     np.testing.assert_allclose(found.apart, 0.6, atol=1e-6)  # of 0 and +-0.6
     assert np.all(np.diff(found.reach) >= -1e-6)
     assert np.all(np.diff(found.coverage) <= 1e-6)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    here, ahead, actions = np.ones(3), np.zeros((5, 3)), np.zeros((5, 2))
+    one = {"expert_action": actions[0], "novice_action": actions[0], "scale": here}
+    seen = horizon.measure(here, ahead, actions, **one)
+    for call in (
+        lambda: horizon.measure(here, ahead[:, :2], actions, **one),
+        lambda: horizon.measure(here, ahead, actions[:4], **one),
+        lambda: horizon.measure(here, ahead, actions, **{**one, "novice_action": actions}),
+        lambda: horizon.measure(here, ahead, actions, **{**one, "scale": ahead}),
+        lambda: horizon.coverage(ahead, ahead, np.ones((5, 3), bool), here),
+        lambda: horizon.coverage(ahead, ahead[None], np.ones((1, 4), bool), here),
+        lambda: horizon.add(horizon.init_horizon(4), seen, np.ones(4, bool)),
+        lambda: horizon.errors(np.zeros(3), np.zeros(4), 1.0),
+    ):
+        with pytest.raises(AssertionError, match=r"shape|rank"):
+            call()

@@ -1,10 +1,12 @@
 import math
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ppl_jax.distributions import gaussian_log_prob, log_likelihood, squashed_gaussian
 from ppl_jax.losses import bc_loss, pair_likelihoods, preference_loss
 
 RNG = np.random.default_rng(0)
@@ -18,7 +20,9 @@ def energy(mean, action, kind):
 
 
 def cpo_loss(mean, good, other, bad, beta, bias=1.0, kind="gaussian"):
-    return preference_loss(pair_likelihoods(mean, good, other, bad, bias, kind), beta, bias)
+    return preference_loss(
+        pair_likelihoods(mean, good, other, bad, bias=bias, likelihood=kind), beta, bias
+    )
 
 
 KINDS = pytest.mark.parametrize("kind", ["gaussian", "laplace"])
@@ -61,8 +65,10 @@ def test_other_objectives_are_loops_over_pairs(objective, target, bias, kind):
         else:
             each = energy(m, good, kind)
         expected += each / 7
-    pairs = pair_likelihoods(MEAN, GOOD, MEAN, BAD, bias, kind, (frozen, frozen))
-    loss, _ = preference_loss(pairs, beta, bias, objective, target)
+    pairs = pair_likelihoods(
+        MEAN, GOOD, MEAN, BAD, bias=bias, likelihood=kind, reference=(frozen, frozen)
+    )
+    loss, _ = preference_loss(pairs, beta, bias, objective=objective, target=target)
     assert float(loss) == pytest.approx(expected, rel=1e-4)
 
 
@@ -73,8 +79,8 @@ def test_only_library_targets_drive_an_action_to_the_corner(objective, target, c
     good, bad = jnp.array([[0.2, 0.0]]), jnp.array([[-0.2, 0.0]])
 
     def loss(mean):
-        pairs = pair_likelihoods(mean, good, mean, bad, 1.0, "gaussian", (0 * good, 0 * good))
-        return preference_loss(pairs, 0.1, 1.0, objective, target)[0]
+        pairs = pair_likelihoods(mean, good, mean, bad, reference=(0 * good, 0 * good))
+        return preference_loss(pairs, 0.1, 1.0, objective=objective, target=target)[0]
 
     def step(mean, _):
         return jnp.clip(mean - 0.02 * jax.grad(loss)(mean), -1.0, 1.0), None
@@ -137,3 +143,69 @@ def test_gradients_are_finite_at_the_corners_of_the_action_box(kind):
             )
             assert bool(jnp.all(jnp.isfinite(gradient)))
         assert bool(jnp.all(jnp.isfinite(jax.grad(lambda m: bc_loss(m, corner, kind)[0])(mean))))
+
+
+PAIRS = pair_likelihoods(MEAN, GOOD, MEAN, BAD)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: log_likelihood(MEAN, GOOD, "student"),
+            "likelihood must be one of gaussian, laplace, got 'student'",
+        ),
+        (
+            lambda: bc_loss(MEAN, GOOD, "gausian"),
+            "got 'gausian': did you mean 'gaussian'?",
+        ),
+        (
+            lambda: bc_loss(MEAN, GOOD, reduction="average"),
+            "reduction must be one of sum, mean, got 'average'",
+        ),
+        (
+            lambda: pair_likelihoods(MEAN, GOOD, MEAN, BAD, likelihood="laplac"),
+            "got 'laplac': did you mean 'laplace'?",
+        ),
+        (
+            lambda: preference_loss(PAIRS, 0.1, objective="slic"),
+            "objective must be one of cpo, dpo, ipo, slic_hf, imitation, got 'slic'",
+        ),
+        (
+            lambda: preference_loss(PAIRS, 0.1, objective="ipo", target="lib"),
+            "target must be one of pair, library, got 'lib'",
+        ),
+        (
+            lambda: preference_loss(PAIRS, 0.1, target="libary"),  # cpo has none, yet it is wrong
+            "got 'libary': did you mean 'library'?",
+        ),
+    ],
+)
+def test_an_unknown_name_is_refused_with_those_that_there_are(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        call()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: bc_loss(jnp.zeros((4, 1)), jnp.arange(4.0)),
+        lambda: bc_loss(MEAN, GOOD[:3]),
+        lambda: bc_loss(MEAN, GOOD, weight=np.ones((7, 1))),
+        lambda: bc_loss(MEAN, GOOD, weight=np.ones(3)),
+        lambda: log_likelihood(MEAN, GOOD[0]),
+        lambda: gaussian_log_prob(MEAN, np.zeros(2), GOOD),
+        lambda: gaussian_log_prob(MEAN, np.zeros(3), GOOD[0]),
+        lambda: squashed_gaussian(jax.random.key(0), MEAN, np.zeros(3)),
+        lambda: pair_likelihoods(MEAN, GOOD, MEAN, BAD[:3]),
+        lambda: pair_likelihoods(MEAN, GOOD, MEAN, BAD, reference=(MEAN, MEAN[:, :1])),
+        lambda: pair_likelihoods(MEAN[0], GOOD[0], MEAN[0], BAD[0]),
+        lambda: preference_loss(PAIRS._replace(rejected=np.zeros((7, 1))), 0.1),
+        lambda: preference_loss(PAIRS._replace(reference=np.zeros((7, 1))), 0.1),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(call):
+    with pytest.raises(AssertionError, match=r"shape|broadcast|rank") as error:
+        call()
+    assert "\n" not in str(error.value)

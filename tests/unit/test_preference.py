@@ -150,3 +150,16 @@ def test_the_gate_that_compares_with_the_expert(case, shift, expected):
     assert bool(deviates_from_expert(point(novice, experts), hparams, SCALE)) is expected
     with pytest.raises(ValueError, match="expert's own prediction"):
         deviates_from_expert(point(novice), hparams, SCALE)
+
+
+def test_unknown_states_and_shapes_that_do_not_fit_are_refused():
+    step = interaction(True, trajectory())
+    with pytest.raises(ValueError, match="one of predicted, shifted, got 'shift': did you mean"):
+        preference_pairs(step, 3, "shift")
+    for wrong in (
+        {"observation": jnp.zeros(O + 1)},
+        {"novice_action": jnp.zeros((1, A))},
+        {"predicted": trajectory().replace(valid=jnp.ones(M + 1, bool))},
+    ):
+        with pytest.raises(AssertionError, match="shape"):
+            preference_pairs(step.replace(**wrong), 3)
