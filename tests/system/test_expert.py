@@ -16,7 +16,7 @@ from experiments.engine.policy_file import load_policy, save_policy
 from experiments.engine.runtime import UserError
 from experiments.report import card, figures
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.ppo.config import PPOConfig, PPOHParams
+from ppl_jax.ppo.config import PPOConfig, PPOHParams, read
 from tests.helpers import Probe, outcome
 
 if "probe" not in envs.registered():
@@ -50,7 +50,7 @@ def test_a_run_leaves_what_is_needed_to_go_on_and_to_make_it_again(run, capsys):
     assert "eval/success_rate" in rows[-1]
     config = json.loads((run / "config.json").read_text())
     assert card.command_of(config).startswith(
-        "ppl expert train probe --total-steps 1024 --worlds 8"
+        "ppl expert train probe --total-steps 1024 --num-envs 8"
     )
     summary = json.loads((run / "summary.json").read_text())
     assert summary["total_steps"] == 1024
@@ -73,6 +73,31 @@ def test_a_card_and_a_curve(run, tmp_path):
     assert (tmp_path / "probe.npz").read_bytes() == (run / "policy.npz").read_bytes()
     figures.expert_curves(tmp_path, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 5000
+
+
+def test_a_card_replaces_nothing(run, tmp_path, capsys):
+    shipped = pretrained.policy_path("driving").parent
+    main(["expert", "card", str(run), "--out", str(tmp_path)])
+    before = (tmp_path / "probe.json").read_bytes()
+    for words, message in (
+        (["--out", str(tmp_path)], "exists: give another --out"),
+        (["--out", str(shipped), "--force"], "holds the shipped experts"),
+    ):
+        with pytest.raises(SystemExit) as error:
+            main(["expert", "card", str(run), *words])
+        assert error.value.code == 2
+        assert message in capsys.readouterr().err
+    assert (tmp_path / "probe.json").read_bytes() == before
+    assert not (shipped / "probe.json").exists()
+    main(["expert", "card", str(run), "--out", str(tmp_path), "--force"])
+
+
+def test_settings_of_shipped_cards_are_read_under_their_old_names():
+    for name in SHIPPED:
+        told = json.loads(pretrained.policy_path(name).with_suffix(".json").read_text())
+        assert read(told["config"], told["hparams"]) == expert.settings_for(name)[:2]
+    with pytest.raises(ValueError, match="unknown settings of PPO-Lagrangian: speed"):
+        read({"speed": 1}, {})
 
 
 def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch):
