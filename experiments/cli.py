@@ -533,10 +533,10 @@ class Play:
 
     env: Positional[str | None] = None
     """Environment: driving, table_wiping or nut_assembly; with --resume that of the folder."""
-    algorithm: str | None = None
-    """Method that learns from you: ppl (default), pvp, hg_dagger, iwr, eil or haco."""
-    seed: int | None = None
-    """Random seed (default: 0)."""
+    algorithm: str = "ppl"
+    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
+    seed: int = 0
+    """Random seed."""
     total_steps: int | None = None
     """Steps of the session."""
     preference_horizon: int | Literal["auto"] | None = None
@@ -545,14 +545,14 @@ class Play:
     """Temperature of the preference loss."""
     learning_rate: float | None = None
     """Of Adam."""
-    manual_episodes: int | None = None
-    """Number of episodes at the start in which you make every step (default: 0)."""
-    participant: str | None = None
+    manual_episodes: int = 0
+    """Number of episodes at the start in which you make every step."""
+    participant: str = ""
     """Your name in a study: at most 32 letters, digits, - and _."""
     consent: Path | None = None
     """Text file to agree to before anything starts."""
-    familiarisation: int | None = None
-    """Successes in a row, driving alone, before steps count (default: 0; the paper: 10)."""
+    familiarisation: int = 0
+    """Successes in a row, driving alone, before steps count (the paper: 10)."""
     questions: Path | None = None
     """JSON file of questions asked after every episode."""
     rate: float | None = None
@@ -565,12 +565,13 @@ class Play:
     """Port to listen on; 0 takes a free one."""
     expose: bool = False
     """Allow a host that others on the network can reach."""
-    evaluate: bool | None = None
-    """Play the held-out scenarios at the end (default: yes)."""
+    evaluate: bool = True
+    """Play the held-out scenarios at the end."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
     """Continue the session in --out; its settings come from there."""
+    words: tyro.conf.Suppress[tuple[str, ...]] = ()
 
 
 @dataclasses.dataclass
@@ -885,13 +886,10 @@ def _render(command: Render) -> None:
 
 def _play(command: Play) -> None:
     from experiments.engine.runtime import start_jax
+    from experiments.ui.options import named_options
     from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 
-    given = {
-        name: value
-        for name, value in vars(command).items()
-        if value is not None and name not in ("out", "resume", "host", "port", "expose")
-    }
+    given = named_options(command, command.words)
     if command.consent is not None:
         given["consent"] = read_consent(command.consent)
     if command.questions is not None:
@@ -984,11 +982,14 @@ _ACTIONS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
-    if (sys.argv[1:] if argv is None else argv) == [SERVE]:
+    words = sys.argv[1:] if argv is None else argv
+    if words == [SERVE]:
         from experiments.engine.worker import serve
 
         return serve()
-    command = tyro.cli(Command, prog="ppl", args=argv, description=__doc__)
+    command = tyro.cli(Command, prog="ppl", args=words, description=__doc__)
+    if isinstance(command, Play):
+        command.words = tuple(words)
     try:
         _ACTIONS[type(command)](command)
     except UserError as error:

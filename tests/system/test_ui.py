@@ -5,6 +5,7 @@ import json
 import sys
 import threading
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
+from experiments.cli import Play
 from experiments.engine import recording
 from experiments.engine.evaluate import read_evaluation
 from experiments.engine.policy_file import load_policy
@@ -23,6 +25,7 @@ from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.ui import views
 from experiments.ui.config import Question, SessionConfig
+from experiments.ui.options import named_options
 from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 from experiments.ui.protocol import (
     BURST,
@@ -603,6 +606,15 @@ def test_a_session_resumes_with_the_settings_of_its_folder(tmp_path):
         f"cannot resume {str(tmp_path)!r}: its participant is 'p1', asked for 'p2'; its seed is 0, "
         "asked for 3"
     )
+
+
+def test_only_options_that_are_named_are_compared():
+    command = Play(env=None, participant="p1", seed=0, evaluate=False, out=Path("run"), port=0)
+    assert named_options(command, ["play", "--resume", "--out", "run"]) == {}
+    words = ["play", "--participant=p1", "--seed", "0", "--no-evaluate", "--port", "0"]
+    expected = {"participant": "p1", "seed": 0, "evaluate": False}
+    assert named_options(command, words) == expected
+    assert named_options(Play(env="driving"), ["play", "driving"]) == {"env": "driving"}
 
 
 def test_sessions_of_older_versions_resume(tmp_path):
