@@ -1,25 +1,53 @@
-"""What every world shares: stepping with an automatic reset that draws a NEW start."""
+"""What every environment shares: stepping with an automatic reset that draws a NEW start."""
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import EnvSpec, Outcome, StepInfo
+from ppl_jax.cards import EnvCard, card
+from ppl_jax.types import EnvSpec, Expert, Outcome, StepInfo, Transition
 
 
 class Environment:
-    """Base class of worlds: fill in `reset_to`, `transition`, `observe`, `scenario_count`.
+    """Base class of environments: fill in `reset_to`, `transition`, `observe`, `scenario_count`.
 
-    The shape is gymnax 1.0's. See `ppl_jax.types.Env` for the methods' contracts and attributes.
+    The shape is gymnax 1.0's. See `ppl_jax.types.Env` for the methods' contracts and attributes. A
+    method `scripted_expert(key, state, observation, params)`, where a class has one, becomes
+    `experts["scripted"]`; an environment with several experts sets `experts` itself.
     """
 
     name: str
     spec: EnvSpec
     max_episode_steps: int
+    default_params: Any
+    held_out_params: Any
     sequential_on_cpu: bool = False
+
+    if TYPE_CHECKING:  # a protocol's attribute cannot be a cached property to a type checker
+        experts: Mapping[str, Expert]
+        predictors: Mapping[str, Transition]
+    else:
+
+        @functools.cached_property
+        def experts(self) -> Mapping[str, Expert]:
+            """Experts by name; empty where there is none."""
+            scripted = getattr(self, "scripted_expert", None)
+            return {} if scripted is None else {"scripted": scripted}
+
+        @functools.cached_property
+        def predictors(self) -> Mapping[str, Transition]:
+            """Steps that the predictor may roll forward, by name: "simulator" is the true one."""
+            return {"simulator": self.transition}
+
+    @property
+    def card(self) -> EnvCard:
+        """Facts that are known without building it."""
+        return card(self.name)
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: Any) -> Any:
         """The start of scenario `index`."""
@@ -38,6 +66,15 @@ class Environment:
     def scenario_count(self, params: Any) -> int:
         """Number of scenarios in `params`."""
         raise NotImplementedError(f"{type(self).__name__}.scenario_count")
+
+    def scenario_numbers(self, params: Any) -> jax.Array:
+        """Number that results name each scenario by, [S]: 0, 1, 2, ... unless overridden."""
+        return jnp.arange(self.scenario_count(params))
+
+    def readings(self, state: Any) -> list[tuple[str, str]]:
+        """Figures of a concrete state to show a person, as (label, text); none by default."""
+        del state
+        return []
 
     def reset(self, key: jax.Array, params: Any) -> tuple[jax.Array, Any]:
         """Draw a scenario and start it."""
@@ -60,14 +97,19 @@ class Environment:
             key_reset, outcome.terminated | outcome.truncated, state, final, params
         )
         info = StepInfo(
-            outcome.cost, outcome.success, outcome.unsafe, outcome.progress, outcome.speed, final
+            cost=outcome.cost,
+            success=outcome.success,
+            unsafe=outcome.unsafe,
+            progress=outcome.progress,
+            speed=outcome.speed,
+            final_observation=final,
         )
         return observation, state, outcome.reward, outcome.terminated, outcome.truncated, info
 
     def auto_reset(
         self, key: jax.Array, done: jax.Array, state: Any, observation: jax.Array, params: Any
     ) -> tuple[jax.Array, Any]:
-        """(observation, state) to go on from: a new random start where `done`."""
+        """(observation, state) to continue from: a new random start where `done`."""
 
         def restart(_: Any) -> tuple[jax.Array, Any]:
             return self.reset(key, params)

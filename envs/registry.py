@@ -1,20 +1,49 @@
-"""Worlds by name. A user's own world is one `register` call away from the command line."""
+"""Environments by name. One's own is one `register` call away from the command line."""
 
 from __future__ import annotations
 
+import difflib
+import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from envs.driving.card import DRIVING
+from envs.manipulation.cards import NUT_ASSEMBLY, TABLE_WIPING
+from ppl_jax.cards import DEFAULT, EnvCard, register_card
+
+if TYPE_CHECKING:
+    from ppl_jax.types import Env
 
 BRAX = "brax:"
 
-_MAKERS: dict[str, Callable[..., Any]] = {}
+_MAKERS: dict[str, Callable[..., Env]] = {}
+_CHECKED: set[str] = set()
 
 
-def register(name: str, maker: Callable[..., Any]) -> None:
-    """Make `make(name)` call `maker`; a name taken already is an error."""
+def register(
+    name: str, maker: Callable[..., Env], card: EnvCard = DEFAULT, checked: bool = False
+) -> None:
+    """Make `make(name)` call `maker`.
+
+    Args:
+        name: As the user types it.
+        maker: `maker(**options) -> Env`; a class will do.
+        card: What is known of the environment without building it.
+        checked: Its tests call `envs.check.check_env`, so the first `make` need not.
+
+    Raises:
+        ValueError: If the name is no word, or taken, or `maker` cannot be called.
+    """
+    if not name or name.startswith(BRAX) or any(c.isspace() or c in "/\\" for c in name):
+        raise ValueError(f"an environment's name must be one word without {BRAX!r}, got {name!r}")
     if name in _MAKERS:
         raise ValueError(f"environment {name!r} is registered already")
+    if not callable(maker):
+        raise ValueError(f"environment {name!r}: the maker must be callable, got {maker!r}")
     _MAKERS[name] = maker
+    register_card(name, card)
+    if checked:
+        _CHECKED.add(name)
 
 
 def registered() -> tuple[str, ...]:
@@ -23,15 +52,17 @@ def registered() -> tuple[str, ...]:
 
 
 def known(name: str) -> bool:
-    """Whether `make` may know it: a registered world, or one of brax."""
+    """Whether `make` may know it: a registered environment, or one of brax."""
     return name in _MAKERS or name.startswith(BRAX)
 
 
-def make(name: str, **options: Any) -> Any:
-    """Build the world `name`; "brax:NAME" is a brax environment.
+def make(name: str, **options: Any) -> Env:
+    """Build the environment `name`; "brax:NAME" is a brax environment.
+
+    The first one of a name is checked (`envs.check.check_env`).
 
     Raises:
-        ValueError: If no world has that name.
+        ValueError: If no environment has that name, or what was built does not fit: one line.
     """
     if name.startswith(BRAX):
         from envs.adapters.brax import make_brax
@@ -39,32 +70,34 @@ def make(name: str, **options: Any) -> Any:
         return make_brax(name.removeprefix(BRAX), **options)
     if name not in _MAKERS:
         raise ValueError(unknown(name))
-    return _MAKERS[name](**options)
+    env = _MAKERS[name](**options)
+    if name not in _CHECKED:
+        from envs.check import check_env
+
+        check_env(env, name)
+        _CHECKED.add(name)
+    return env
 
 
 def unknown(name: str) -> str:
-    """What to say of a name that no world has."""
-    return f"unknown environment {name!r}: choose one of {', '.join(registered())} or {BRAX}NAME"
+    """What to say of a name that no environment has."""
+    close = difflib.get_close_matches(name, _MAKERS, n=1)
+    hint = f", did you mean {close[0]!r}?" if close else ":"
+    return (
+        f"unknown environment {name!r}{hint} choose one of {', '.join(registered())} or {BRAX}NAME"
+    )
 
 
-def _driving(**options: Any) -> Any:
-    from envs.driving.env import make_driving
+def _shipped(module: str, maker: str) -> Callable[..., Env]:
+    """A maker whose module is imported when it is called: `import envs` stays light."""
 
-    return make_driving(**options)
+    def make_shipped(**options: Any) -> Env:
+        return getattr(importlib.import_module(module), maker)(**options)
 
-
-def _table_wiping(**options: Any) -> Any:
-    from envs.manipulation.tasks.wiping import make_table_wiping
-
-    return make_table_wiping(**options)
+    return make_shipped
 
 
-def _nut_assembly(**options: Any) -> Any:
-    from envs.manipulation.tasks.nut import make_nut_assembly
-
-    return make_nut_assembly(**options)
-
-
-register("driving", _driving)
-register("nut_assembly", _nut_assembly)
-register("table_wiping", _table_wiping)
+_ARM = "envs.manipulation.make"
+register("driving", _shipped("envs.driving.make", "make_driving"), DRIVING, checked=True)
+register("nut_assembly", _shipped(_ARM, "make_nut_assembly"), NUT_ASSEMBLY, checked=True)
+register("table_wiping", _shipped(_ARM, "make_table_wiping"), TABLE_WIPING, checked=True)

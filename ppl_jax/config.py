@@ -1,13 +1,36 @@
-"""Settings: `HParams` are traced (changing one compiles nothing), `TrainConfig` is static."""
+"""Settings: `HParams` are traced (changing one compiles nothing), `TrainConfig` is static.
+
+Both hold what every run has. A method, a gate and a predictor own the rest: `config.method`,
+`hparams.method`, `hparams.gate` and `hparams.predictor` are settings classes of theirs, a user's
+too. Names are unique among them, so that a run's settings are one flat list of names outside:
+`values`, `replace` and `catalogue` read and change them by name.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+import difflib
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from ppl_jax.cards import card
+from ppl_jax.fields import About, about, setting
+
+
+@dataclasses.dataclass(frozen=True)
+class NoConfig:
+    """Static settings of a method that has none of its own."""
+
+
+@flax.struct.dataclass
+class NoHParams:
+    """Traced settings of a method, gate or predictor that has none of its own."""
 
 
 @flax.struct.dataclass
@@ -15,55 +38,30 @@ class HParams:
     """What a study sweeps: leaves of one pytree, so any of them may carry a batch axis.
 
     Attributes:
-        preference_horizon: L, number of predicted states that get a preference pair.
-        beta: Temperature of the preference loss. It multiplies the log-likelihoods that
-            `TrainConfig.likelihood` names (see `ppl_jax.distributions`).
-        bc_weight: Weight of the behaviour-cloning loss.
-        preference_weight: Weight of the preference loss; 0 leaves behaviour cloning alone.
-        preference_bias: Factor on the rejected action's likelihood: 1 in the paper, 0.5 in the
-            released code and by default.
-        prediction_noise: epsilon; noise e with |e| = epsilon |s| on predicted observations s.
-        expert_noise: Standard deviation of noise on the expert's action.
-        learning_rate: Of Adam.
-        min_speed: Gate: the expert takes over where the predicted mean speed is below, m/s.
-        min_return: Gate of the released code and of manipulation: where the predicted return is
-            at or below (the paper's epsilon).
-        max_departure: Gate "deviates_from_expert": how far the prediction may end from where the expert would,
-            in the world's units (`EnvSpec.observation_scale`).
-        min_log_density: Gate "action_probability": log-density under the expert below which it takes over.
-        discount, polyak_tau: gamma, and tau of target networks (methods with critics).
-        margin: EIL: hinge margins of its action values.
-        conservative_weight: HACO: c, weight of raising expert's over novice's action values.
-        max_ensemble_variance: Ensemble-DAgger: variance of the members' actions above which the expert acts.
-        max_discrepancy: Ensemble-DAgger: squared distance between the novice's and the expert's
-            action above which the expert acts.
-        switch_rate: Thrifty-DAgger: alpha, share of the novice's states that each of its two tests
-            is to hand to the expert.
-        discriminator_rate: GAIL: learning rate of the discriminator.
-        survival_correction: GAIL: 1 for the reward log D - log(1 - D), 0 for -log(1 - D).
+        learning_rate, expert_noise, prediction_noise: See the fields' own text.
+        method, gate, predictor: Traced settings that these own.
     """
 
-    preference_horizon: jax.Array | float = 4
-    beta: jax.Array | float = 0.1
-    bc_weight: jax.Array | float = 1.0
-    preference_weight: jax.Array | float = 1.0
-    preference_bias: jax.Array | float = 0.5
-    prediction_noise: jax.Array | float = 0.0
-    expert_noise: jax.Array | float = 0.0
-    learning_rate: jax.Array | float = 3e-4
-    min_speed: jax.Array | float = 5.0
-    min_return: jax.Array | float = 10.0
-    max_departure: jax.Array | float = 1.0
-    min_log_density: jax.Array | float = -3.0
-    discount: jax.Array | float = 0.99
-    polyak_tau: jax.Array | float = 0.005
-    margin: jax.Array | float = 0.1
-    conservative_weight: jax.Array | float = 10.0
-    max_ensemble_variance: jax.Array | float = 0.01
-    max_discrepancy: jax.Array | float = 0.05
-    switch_rate: jax.Array | float = 0.1
-    discriminator_rate: jax.Array | float = 3e-4
-    survival_correction: jax.Array | float = 1.0
+    learning_rate: jax.Array | float = setting(
+        3e-4, "Adam's learning rate.", low=0, group="run", common=True
+    )
+    expert_noise: jax.Array | float = setting(
+        0.0,
+        "Standard deviation of Gaussian noise on the expert's actions.",
+        low=0,
+        group="expert",
+        common=True,
+    )
+    prediction_noise: jax.Array | float = setting(
+        0.0,
+        "epsilon: predicted observations s get noise e with |e| = epsilon |s|.",
+        low=0,
+        group="predictor",
+        common=True,
+    )
+    method: Any = dataclasses.field(default_factory=NoHParams)
+    gate: Any = dataclasses.field(default_factory=NoHParams)
+    predictor: Any = dataclasses.field(default_factory=NoHParams)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,170 +69,257 @@ class TrainConfig:
     """What sets shapes and programs.
 
     Attributes:
-        total_steps: Environment steps of the run, its demonstrations included.
-        demonstrations: Steps at the start of the run that the expert makes all by itself, without
-            updates.
-        offline_updates: Updates that follow them, before the novice makes its first step.
-        prediction_horizon: H, steps of the lookahead the expert sees.
-        decision_interval: Steps a decision holds; a new one is made at steps 0, K, 2K, ...
-        max_preference_horizon: Largest L a run may use (L itself is traced).
-        adaptive_horizon: L is chosen while training, up to `HParams.preference_horizon`, from what
-            the expert would do at predicted states (see `ppl_jax.horizon`).
-        batch_size: Samples per loss and update.
-        hidden: Widths of the policy's hidden layers.
-        human_capacity, preference_capacity: Of the ring buffers; the oldest go first.
-        predictor: The world's own transition, or the rule-based kinematic one.
-        gate: What makes the expert take over: an unsafe or slow prediction, a low return, or one
-            that deviates_from_expert from what the expert would do from here (one more lookahead per decision;
-            it asks the policy again at every predicted state), or an action that the expert
-            finds unlikely (neural experts alone).
-        gate_rollout: The lookahead holds the proposed action, or asks the policy again at every
-            predicted state.
-        pair_states: Pairs at predicted states 1..L, or as the released code makes them: preferred
-            action at state k, rejected one at state k + 1, k = 0..L-1, 0 being the present.
-        likelihood: Which log pi the losses mean (see `ppl_jax.distributions`).
-        bc_reduction: Squared error summed (the log-likelihood) or averaged over action dimensions.
-        random_steps: Steps at the start in which the novice proposes uniform random actions.
-        objective: What is minimised on preference pairs (see `ppl_jax.losses`).
-        objective_target: Margin that IPO and SLiC-HF aim at: that of a policy which acts as the
-            expert did, or the libraries' constants (which bounded actions cannot reach).
-        preferred, rejected: Actions of the pairs: as in the paper, or (for its ablations) uniform
-            random ones.
-        members: Policies of an ensemble.
-        rollout_steps: Steps between the updates of an on-policy method.
+        method: Static settings that the method owns.
     """
 
-    total_steps: int = 10_000
-    demonstrations: int = 0
-    offline_updates: int = 0
-    prediction_horizon: int = 10
-    decision_interval: int = 10
-    max_preference_horizon: int = 10
-    adaptive_horizon: bool = False
-    batch_size: int = 256
-    hidden: tuple[int, ...] = (256, 256)
-    human_capacity: int = 50_000
-    preference_capacity: int = 50_000
-    predictor: Literal["simulator", "kinematic"] = "simulator"
-    gate: Literal["unsafe_or_slow", "low_return", "deviates_from_expert", "action_probability"] = (
-        "unsafe_or_slow"
+    total_steps: int = setting(
+        10_000, "Environment steps, demonstrations included.", low=1, group="run", common=True
     )
-    gate_rollout: Literal["constant", "closed_loop"] = "constant"
-    pair_states: Literal["predicted", "shifted"] = "predicted"
-    likelihood: Literal["gaussian", "laplace"] = "gaussian"
-    bc_reduction: Literal["sum", "mean"] = "sum"
-    random_steps: int = 0
-    objective: Literal["cpo", "dpo", "ipo", "slic_hf", "imitation"] = "cpo"
-    objective_target: Literal["pair", "library"] = "pair"
-    preferred: Literal["expert", "random"] = "expert"
-    rejected: Literal["novice", "random"] = "novice"
-    members: int = 5
-    rollout_steps: int = 2000
+    demonstrations: int = setting(
+        0,
+        "Steps at the start that the expert makes by itself, without updates.",
+        low=0,
+        group="run",
+        common=True,
+    )
+    offline_updates: int = setting(
+        0,
+        "Updates on the demonstrations before the novice makes its first step.",
+        low=0,
+        group="run",
+    )
+    batch_size: int = setting(256, "Samples per loss and update.", low=1, group="run", common=True)
+    hidden: tuple[int, ...] = setting(
+        (256, 256), "Widths of the hidden layers.", low=1, group="run", common=True
+    )
+    human_capacity: int = setting(
+        50_000,
+        "Rows of the buffer of expert steps; the oldest go first.",
+        low=1,
+        group="run",
+    )
+    random_steps: int = setting(
+        0,
+        "Steps at the start in which the novice proposes uniform random actions.",
+        low=0,
+        group="run",
+    )
+    prediction_horizon: int = setting(
+        10, "H: steps of the lookahead that the expert sees.", low=1, group="predictor", common=True
+    )
+    predictor: str = setting(
+        "simulator",
+        "Transition that predictions use; `ppl list` names them.",
+        group="predictor",
+        common=True,
+    )
+    gate: str = setting(
+        "unsafe_or_slow",
+        "Rule by which the expert takes over; `ppl list` names them.",
+        group="gate",
+        common=True,
+    )
+    decision_interval: int = setting(
+        10,
+        "K: steps that a decision holds; the gate runs at multiples of K.",
+        low=1,
+        group="gate",
+    )
+    gate_rollout: Literal["constant", "closed_loop"] = setting(
+        "constant",
+        "The lookahead holds the proposed action, or asks the policy at every predicted state.",
+        choices=("constant", "closed_loop"),
+        group="gate",
+    )
+    likelihood: Literal["gaussian", "laplace"] = setting(
+        "gaussian",
+        "Density behind log pi in the losses.",
+        choices=("gaussian", "laplace"),
+        common=True,
+    )
+    bc_reduction: Literal["sum", "mean"] = setting(
+        "sum",
+        "Cloning error summed (the log-likelihood) or averaged over action dimensions.",
+        choices=("sum", "mean"),
+    )
+    method: Any = dataclasses.field(default_factory=NoConfig)
 
 
-# what the paper sets per task where it differs from driving (section 5 and its appendix)
-_TASKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "table_wiping": (
-        {"total_steps": 4000, "gate": "low_return", "max_preference_horizon": 4},
-        {"preference_horizon": 4, "min_return": 1.0},
-    ),
-    "nut_assembly": (
-        {
-            "total_steps": 200_000,
-            "gate": "low_return",
-            "max_preference_horizon": 6,
-            "human_capacity": 200_000,
-            "preference_capacity": 200_000,
-        },
-        {"preference_horizon": 6, "min_return": 2.0},
-    ),
-}
-_MARKER = 1.64  # robosuite's normalised reward for one wiped marker
+OWNED_CONFIG = ("method",)
+OWNED_HPARAMS = ("method", "gate", "predictor")
+T = TypeVar("T")
 
 
-def default(task: str = "driving") -> tuple[TrainConfig, HParams]:
-    """What works best here: the paper's horizons, beta, gate and pairs; the released code's bias.
+class Setting(NamedTuple):
+    """One setting of a run.
 
-    The paper's loss (bias 1) has no optimum inside the action box for a Gaussian policy and
-    overshoots (`ppl_jax.distributions`); the README has the figures. In wiping, epsilon = 1 counts
-    markers: the paper does not say in which unit its reward is, and with 1 of robosuite's
-    normalised reward a wiper that hovers over the dirt's centroid for ever passes the gate.
+    Attributes:
+        name: Unique among the settings of a run.
+        kind: Its Python type.
+        value: Its value in this run.
+        about: Help, range, choices, group.
+        traced: Whether changing it compiles nothing.
     """
-    static, traced = _TASKS.get(task, ({}, {}))
-    config, hparams = TrainConfig(**static), HParams(**traced)
-    if task == "table_wiping":
-        hparams = dataclasses.replace(hparams, min_return=_MARKER)
-    return config, hparams
+
+    name: str
+    kind: Any
+    value: Any
+    about: About
+    traced: bool
 
 
-def paper(task: str = "driving") -> tuple[TrainConfig, HParams]:
-    """The paper's formula to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias 1.
+def _parts(config: TrainConfig, hparams: HParams) -> list[tuple[Any, tuple[str, ...], bool]]:
+    """Every settings object of a run, its fields that are such objects, and if it is traced."""
+    return [
+        (config, OWNED_CONFIG, False),
+        (config.method, (), False),
+        (hparams, OWNED_HPARAMS, True),
+        *((getattr(hparams, owner), (), True) for owner in OWNED_HPARAMS),
+    ]
 
-    The paper leaves network, batch, learning rate and likelihood open; the Laplace one is that
-    under which its formula has an optimum.
-    """
-    static, traced = _TASKS.get(task, ({}, {}))
-    return TrainConfig(likelihood="laplace", **static), HParams(preference_bias=1.0, **traced)
+
+def settings_fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
+    """The fields of a settings class by name, those that other owners fill left out."""
+    owned = {TrainConfig: OWNED_CONFIG, HParams: OWNED_HPARAMS}.get(cls, ())
+    return {field.name: field for field in dataclasses.fields(cls) if field.name not in owned}
 
 
-def reference(task: str = "driving") -> tuple[TrainConfig, HParams]:
-    """The released code's settings (metadriverse/PPL at 7a55c24), which is for driving alone.
+def _kinds(cls: type) -> dict[str, Any]:
+    """The type of each field's value; a traced field has that of its default."""
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError:  # a class made inside a function
+        hints = {}
+    kinds = {}
+    for name, field in settings_fields(cls).items():
+        hint = hints.get(name, type(field.default))
+        traced = jax.Array in typing.get_args(hint)
+        kinds[name] = type(field.default) if traced else hint
+    return kinds
+
+
+def catalogue(config: TrainConfig, hparams: HParams) -> dict[str, Setting]:
+    """Every setting of a run by its flat name, in the order of the classes."""
+    found: dict[str, Setting] = {}
+    for part, _, traced in _parts(config, hparams):
+        kinds = _kinds(type(part))
+        for name, field in settings_fields(type(part)).items():
+            found[name] = Setting(
+                name=name,
+                kind=kinds[name],
+                value=getattr(part, name),
+                about=about(field),
+                traced=traced,
+            )
+    return found
+
+
+def values(config: TrainConfig, hparams: HParams) -> dict[str, Any]:
+    """Every setting's value by its flat name."""
+    return {name: setting.value for name, setting in catalogue(config, hparams).items()}
+
+
+def traced_values(hparams: HParams) -> dict[str, Any]:
+    """The traced settings' values by their flat names."""
+    config = TrainConfig()
+    return {name: s.value for name, s in catalogue(config, hparams).items() if s.traced}
+
+
+def replace(config: TrainConfig, hparams: HParams, **changes: Any) -> tuple[TrainConfig, HParams]:
+    """The settings with some of them changed by their flat names.
 
     Raises:
-        ValueError: For another task.
+        ValueError: If a name is no setting of this run.
     """
-    if task in _TASKS:
-        raise ValueError(
-            f"preset 'reference' is for driving alone, got {task}: choose default or paper"
-        )
-    config = TrainConfig(
-        prediction_horizon=20,
-        decision_interval=10,
-        max_preference_horizon=3,
-        batch_size=1024,
-        predictor="kinematic",
-        gate="low_return",
-        gate_rollout="closed_loop",
-        pair_states="shifted",
-        likelihood="gaussian",
-        bc_reduction="mean",
-        random_steps=10,
-    )
-    return config, HParams(preference_horizon=3, preference_bias=0.5, learning_rate=1e-4)
+    known = catalogue(config, hparams)
+    for name in changes:
+        if name not in known:
+            raise ValueError(f"unknown setting {name!r}{did_you_mean(name, known)}")
+
+    def changed(part: T) -> T:
+        mine = {k: v for k, v in changes.items() if k in settings_fields(type(part))}
+        return dataclasses.replace(part, **mine) if mine else part  # pyright: ignore[reportArgumentType]
+
+    owned = {name: changed(getattr(hparams, name)) for name in OWNED_HPARAMS}
+    config = dataclasses.replace(changed(config), method=changed(config.method))
+    return config, dataclasses.replace(changed(hparams), **owned)
 
 
-PRESETS = {"default": default, "paper": paper, "reference": reference}
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """`: did you mean 'x'?` where a known name is near, else the empty string."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f": did you mean {near[0]!r}?" if near else ""
 
-_AT_LEAST_ONE = (
-    "total_steps",
-    "prediction_horizon",
-    "decision_interval",
-    "max_preference_horizon",
-    "batch_size",
-    "human_capacity",
-    "preference_capacity",
-    "members",
-    "rollout_steps",
-)
-_NOT_NEGATIVE = (
-    "beta",
-    "bc_weight",
-    "preference_weight",
-    "preference_bias",
-    "prediction_noise",
-    "expert_noise",
-    "learning_rate",
-    "max_departure",
-    "polyak_tau",
-    "margin",
-    "conservative_weight",
-    "max_ensemble_variance",
-    "max_discrepancy",
-    "switch_rate",
-    "discriminator_rate",
-    "survival_correction",
-)
-_SHARES = ("discount", "polyak_tau", "switch_rate", "survival_correction")
+
+def check_unique(*classes: type) -> None:
+    """Check that settings classes share no name with each other or with what every run has.
+
+    Raises:
+        ValueError: If one is there twice.
+    """
+    seen: dict[str, type] = {}
+    for cls in (TrainConfig, HParams, *classes):
+        for name in settings_fields(cls):
+            if seen.get(name, cls) is not cls:
+                raise ValueError(
+                    f"setting {name!r} of {cls.__name__} is one of {seen[name].__name__} already"
+                )
+            seen[name] = cls
+
+
+PRESETS = ("default", "paper", "reference")
+
+
+def preset_values(preset: str, env: str) -> dict[str, Any]:
+    """The flat settings that a preset gives a run in an environment.
+
+    `default`: what works best here: the paper's horizons, beta, gate and pairs; the released code's
+    bias. The paper's loss (bias 1) has no optimum inside the action box for a Gaussian policy and
+    overshoots (`ppl_jax.distributions`).
+
+    `paper`: the paper's formula to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias
+    1. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is that
+    under which its formula has an optimum.
+
+    `reference`: the released code's settings (metadriverse/PPL at 7a55c24), for driving alone.
+
+    Args:
+        preset: "default", "paper" or "reference".
+        env: Name of the environment.
+
+    Raises:
+        ValueError: If there is no such preset, or it is not for the environment.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    about_env = card(env)
+    if preset in about_env.missing_presets:
+        others = [name for name in PRESETS if name not in about_env.missing_presets]
+        raise ValueError(f"preset {preset!r} is not for {env}: choose {' or '.join(others)}")
+    own = about_env.changes(preset)
+    if preset == "reference":
+        return {**_REFERENCE, **own}
+    if preset == "paper":
+        return {"likelihood": "laplace", "preference_bias": 1.0, **own}
+    return own
+
+
+_REFERENCE: Mapping[str, Any] = {
+    "prediction_horizon": 20,
+    "decision_interval": 10,
+    "max_preference_horizon": 3,
+    "batch_size": 1024,
+    "predictor": "kinematic",
+    "gate": "low_return",
+    "gate_rollout": "closed_loop",
+    "pair_states": "shifted",
+    "likelihood": "gaussian",
+    "bc_reduction": "mean",
+    "random_steps": 10,
+    "preference_horizon": 3,
+    "preference_bias": 0.5,
+    "learning_rate": 1e-4,
+}
 
 
 def validate(config: TrainConfig, hparams: HParams) -> None:
@@ -247,13 +332,11 @@ def validate(config: TrainConfig, hparams: HParams) -> None:
     Raises:
         ValueError: One line naming field, value and what is allowed.
     """
-    for field in _AT_LEAST_ONE:
-        value = getattr(config, field)
-        if value < 1:
-            raise ValueError(f"{field} must be at least 1, got {value}")
+    for one in catalogue(config, hparams).values():
+        check_value(one.name, one.value, one.about)
     for field in ("total_steps", "demonstrations", "offline_updates"):
         value = getattr(config, field)
-        if value < 0 or value % config.decision_interval:
+        if value % config.decision_interval:
             raise ValueError(
                 f"{field} must be a multiple of decision_interval ({config.decision_interval}), "
                 f"got {value}"
@@ -268,37 +351,47 @@ def validate(config: TrainConfig, hparams: HParams) -> None:
             f"offline_updates needs demonstrations to learn from, got {config.offline_updates} "
             "without any"
         )
-    if not config.hidden or min(config.hidden) < 1:
+    if not config.hidden:
         raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
-    horizon = jnp.asarray(hparams.preference_horizon)
-    if bool(jnp.any(horizon < 1)):
-        raise ValueError(f"preference_horizon must be at least 1, got {_show(horizon)}")
-    if bool(jnp.any(horizon > config.prediction_horizon)):
-        raise ValueError(
-            f"preference_horizon must not exceed prediction_horizon "
-            f"({config.prediction_horizon}), got {_show(horizon)}"
-        )
-    if bool(jnp.any(horizon > config.max_preference_horizon)):
-        raise ValueError(
-            f"preference_horizon must not exceed max_preference_horizon "
-            f"({config.max_preference_horizon}), got {_show(horizon)}"
-        )
-    for field in _NOT_NEGATIVE:
-        value = jnp.asarray(getattr(hparams, field))
-        if not bool(jnp.all(value >= 0)):  # catches NaN too
-            raise ValueError(f"{field} must not be negative, got {_show(value)}")
-    for field in ("min_return", "min_log_density"):
-        value = jnp.asarray(getattr(hparams, field))
-        if bool(jnp.any(jnp.isnan(value))):
-            raise ValueError(f"{field} must be a number, got {_show(value)}")
-    for field in _SHARES:
-        value = jnp.asarray(getattr(hparams, field))
-        if not bool(jnp.all((value >= 0) & (value <= 1))):
-            raise ValueError(f"{field} must lie between 0 and 1, got {_show(value)}")
+    check = getattr(config.method, "check", None)
+    if check is not None:
+        check(config, hparams)
 
 
-def _show(value: jax.Array) -> Any:
-    return value.item() if value.ndim == 0 else value.tolist()
+def check_value(name: str, value: Any, about: About) -> None:
+    """Check one setting against what its field allows.
+
+    Args:
+        name: Of the setting.
+        value: A name, a switch, or numbers.
+        about: Range and choices.
+
+    Raises:
+        ValueError: One line naming field, value and what is allowed.
+    """
+    if isinstance(value, str):
+        if about.choices is not None and value not in about.choices:
+            raise ValueError(
+                f"{name} must be one of {', '.join(about.choices)}, got {value!r}"
+                + did_you_mean(value, about.choices)
+            )
+        return
+    if isinstance(value, bool) or value is None:
+        return
+    numbers = np.asarray(value, np.float64)
+    shown = numbers.tolist() if numbers.ndim else value
+    if name == "hidden":
+        shown = value
+    low, high = about.low, about.high
+    if low is not None and high is not None and not ((numbers >= low) & (numbers <= high)).all():
+        raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {shown}")
+    if low is not None and not (numbers >= low).all():
+        allowed = "not be negative" if low == 0 else f"be at least {low:g}"
+        raise ValueError(f"{name} must {allowed}, got {shown}")
+    if high is not None and not (numbers <= high).all():
+        raise ValueError(f"{name} must be at most {high:g}, got {shown}")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be a finite number, got {shown}")
 
 
 def as_arrays(hparams: HParams) -> HParams:

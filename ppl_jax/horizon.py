@@ -29,9 +29,9 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.gates import COMPARING, RULES
-from ppl_jax.predictors import Act, predict, selected_transition
-from ppl_jax.types import Env, Expert
+from ppl_jax.gates import gate
+from ppl_jax.predictors import Act, predict, predictor
+from ppl_jax.types import DecisionPoint, Env, Expert
 
 MEMORY = 500  # predicted trajectories that the moving means look back
 
@@ -178,7 +178,7 @@ def make_profile(
     """`profile(key, act, hparams)`: what preferences at predicted states would be worth now.
 
     The novice alone plays training scenarios. Where the gate would hand over, its action is
-    predicted `config.max_preference_horizon` steps ahead and the expert asked at every one.
+    predicted `config.method.max_preference_horizon` steps ahead and the expert asked at every one.
 
     Args:
         env: The world.
@@ -190,14 +190,18 @@ def make_profile(
     Raises:
         ValueError: If the gate is one that compares with the expert's own prediction.
     """
-    if config.gate not in RULES or config.gate in COMPARING:
+    rule = gate(config.gate)
+    if rule.needs_expert_rollout or rule.needs_density:
         raise ValueError(f"gate must judge a prediction by itself, got {config.gate!r}")
-    transition, rule = selected_transition(env, config.predictor), RULES[config.gate]
+    predicted_transition = predictor(config.predictor).make(env)
     params, scale = env.default_params, jnp.asarray(env.spec.observation_scale)
-    ahead = max(config.prediction_horizon, config.max_preference_horizon)
-    most = config.max_preference_horizon
+    ahead = max(config.prediction_horizon, config.method.max_preference_horizon)
+    most = config.method.max_preference_horizon
 
     def profile(key: jax.Array, act: Act, hparams: HParams) -> Profile:
+        def transition(*args: Any) -> Any:
+            return predicted_transition(*args, hparams.predictor)
+
         def step(carry: Any, _: None) -> Any:
             key, observation, state = carry
             key, key_expert, key_ahead, key_step = jax.random.split(key, 4)
@@ -215,7 +219,16 @@ def make_profile(
                 labelling_expert=expert,
             )
             judged = jax.tree.map(lambda leaf: leaf[: config.prediction_horizon], found)
-            takeover = rule(judged, None, hparams, scale)
+            point = DecisionPoint(
+                observation=observation,
+                novice_action=held,
+                expert_action=wanted,
+                takeover=jnp.zeros((), bool),
+                trajectory=judged,
+                experts=None,
+                log_density=jnp.asarray(jnp.nan),
+            )
+            takeover = rule.decide(point, hparams.gate, scale)
             assert found.expert_actions is not None  # an labelling_expert was there
             states, expert_actions, valid = (
                 leaf[:most] for leaf in (found.observation, found.expert_actions, found.valid)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.config import HParams, TrainConfig, as_arrays
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import add_noise, predict, selected_transition
+from ppl_jax.predictors import add_noise, predict, predictor
 from ppl_jax.types import Env, Expert, Interaction, Trajectory
 
 PyTree = Any
@@ -74,8 +74,10 @@ class Steps(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the novice, not yet clipped.
-        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with its noise.
+        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the
+            novice, not yet clipped.
+        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with
+            its noise.
         interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step of
             whoever `learner.takeover` says, the expert's action being `action` where it is given.
             `started`: an expert in control was not in the step before.
@@ -107,7 +109,7 @@ def make_steps(
     Raises:
         ValueError: If the world lacks the predictor that `config` names.
     """
-    transition = selected_transition(env, config.predictor)
+    predicted_transition = predictor(config.predictor).make(env)
 
     def init(key: jax.Array, hparams: HParams) -> Learner:
         key, key_algorithm, key_env = jax.random.split(key, 3)
@@ -140,10 +142,17 @@ def make_steps(
         return jnp.clip(action + noise, -1.0, 1.0)
 
     def ahead(
-        takeover: jax.Array, key: jax.Array, state: PyTree, action: jax.Array, params: PyTree
+        takeover: jax.Array,
+        key: jax.Array,
+        state: PyTree,
+        action: jax.Array,
+        params: PyTree,
+        hparams: PyTree,
     ) -> Trajectory:
+        def transition(*args: Any) -> Any:
+            return predicted_transition(*args, hparams)
+
         def roll() -> Trajectory:
-            horizon = config.max_preference_horizon
             return predict(
                 env,
                 transition,
@@ -151,9 +160,9 @@ def make_steps(
                 state,
                 action,
                 params,
-                horizon,
+                algorithm.predicted_steps,
                 observe=True,
-                labelling_expert=expert if config.adaptive_horizon else None,
+                labelling_expert=expert if algorithm.labels_predictions else None,
             )
 
         def nothing() -> Trajectory:
@@ -171,7 +180,14 @@ def make_steps(
     def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
         """The first predicted states, for the pairs; skipped while the novice is in control."""
         key_predict, key_noise = jax.random.split(key)
-        trajectory = ahead(learner.takeover, key_predict, learner.env_state, action, params)
+        trajectory = ahead(
+            learner.takeover,
+            key_predict,
+            learner.env_state,
+            action,
+            params,
+            learner.hparams.predictor,
+        )
         noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
         return dataclasses.replace(trajectory, observation=noisy)
 
@@ -209,7 +225,7 @@ def make_steps(
         expert_action = query_expert(learner, key_expert, observation) if action is None else action
         takeover = learner.takeover
         executed = jnp.where(takeover, expert_action, jnp.clip(novice_action, -1.0, 1.0))
-        if algorithm.uses_predictions:
+        if algorithm.predicted_steps:
             predicted = look_ahead(learner, key_ahead, novice_action)
         else:
             empty = jnp.zeros((0,))

@@ -17,7 +17,7 @@ from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.interaction import Learner, Steps, make_steps, summarise
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import predict, selected_transition
+from ppl_jax.predictors import predict, predictor
 from ppl_jax.types import Env, Interaction, Trajectory
 
 PyTree = Any
@@ -74,12 +74,16 @@ def make_live(
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
-    transition = selected_transition(env, config.predictor)
+    predicted_transition = predictor(config.predictor).make(env)
     steps = make_steps(env, None, algorithm, config, params)
 
     def predict_path(learner: Learner, action: jax.Array, mine: jax.Array) -> Trajectory:
         key_propose, key_predict = jax.random.split(learner.key)
         observation = env.observe(learner.env_state, params)
+
+        def transition(*args: Any) -> Any:
+            return predicted_transition(*args, learner.hparams.predictor)
+
         proposed = jnp.clip(
             steps.sample_novice_action(learner, key_propose, observation), -1.0, 1.0
         )

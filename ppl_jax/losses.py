@@ -105,6 +105,7 @@ def pair_likelihoods(
     )
 
 
+OBJECTIVES = ("cpo", "dpo", "ipo", "slic_hf", "imitation")
 NEEDS_REFERENCE = ("dpo", "ipo")
 
 

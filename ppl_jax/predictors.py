@@ -6,12 +6,13 @@ It rolls any transition function forward by value, so the state it started from 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import Env, Expert, Trajectory, Transition
+from ppl_jax.config import NoHParams, check_unique, did_you_mean
+from ppl_jax.types import Env, Expert, Outcome, Trajectory, Transition
 
 Act = Callable[[jax.Array], jax.Array]
 """`act(observation [O]) -> action [A]`."""
@@ -93,15 +94,87 @@ def add_noise(key: jax.Array, observation: jax.Array, epsilon: jax.Array | float
     return observation + epsilon * norm / jnp.maximum(length, 1e-12) * noise
 
 
-def selected_transition(env: Env, predictor: str) -> Transition:
-    """The transition a `TrainConfig.predictor` names.
+class Predictor(NamedTuple):
+    """A registered predictor.
+
+    Attributes:
+        make: `make(env) -> transition(key, state, action, params, hparams)`, the transition that
+            predictions use; `hparams` are the predictor's own. It raises `ValueError` where the
+            environment has none.
+        hparams: Class of its traced settings.
+    """
+
+    make: Callable[[Env], Callable[..., tuple[Any, Outcome]]]
+    hparams: type = NoHParams
+
+
+def _environments_own(name: str) -> Callable[[Env], Callable[..., tuple[Any, Outcome]]]:
+    """A predictor that the environment brings: `env.predictors[name]`."""
+
+    def make(env: Env) -> Callable[..., tuple[Any, Outcome]]:
+        if name not in env.predictors:
+            raise ValueError(
+                f"environment {env.name!r} has no predictor {name!r}: choose one of "
+                f"{', '.join(env.predictors)}"
+            )
+        transition = env.predictors[name]
+
+        def predicted(
+            key: jax.Array, state: Any, action: jax.Array, params: Any, hparams: Any
+        ) -> tuple[Any, Outcome]:
+            del hparams
+            return transition(key, state, action, params)
+
+        return predicted
+
+    return make
+
+
+_PREDICTORS: dict[str, Predictor] = {}
+
+
+def register_predictor(
+    name: str,
+    make: Callable[[Env], Callable[..., tuple[Any, Outcome]]],
+    *,
+    hparams: type = NoHParams,
+) -> None:
+    """Make a predictor known by name, to every environment and to the command line.
+
+    Args:
+        name: As in `--predictor NAME`.
+        make: `make(env) -> transition(key, state, action, params, hparams) -> (state, outcome)`;
+            it raises `ValueError` for an environment that it cannot predict.
+        hparams: Class of its own traced settings: a `flax.struct.dataclass` whose fields are made
+            by `ppl_jax.fields.setting(..., group="predictor")`.
 
     Raises:
-        ValueError: If the world has no such predictor.
+        ValueError: If the name is taken, or a setting's is.
     """
-    if predictor == "simulator":
-        return env.transition
-    transition = getattr(env, "transition_kinematic", None)
-    if predictor != "kinematic" or transition is None:
-        raise ValueError(f"environment {env.name!r} has no predictor {predictor!r}")
-    return transition
+    if name in _PREDICTORS:
+        raise ValueError(f"predictor {name!r} is registered already")
+    check_unique(hparams)
+    _PREDICTORS[name] = Predictor(make, hparams)
+
+
+register_predictor("simulator", _environments_own("simulator"))
+register_predictor("kinematic", _environments_own("kinematic"))
+
+
+def registered_predictors() -> tuple[str, ...]:
+    """Names of the predictors, in order."""
+    return tuple(_PREDICTORS)
+
+
+def predictor(name: str) -> Predictor:
+    """A predictor by name.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if name not in _PREDICTORS:
+        raise ValueError(
+            f"predictor must be one of {', '.join(_PREDICTORS)}, got {name!r}"
+            f"{did_you_mean(name, _PREDICTORS)}"
+        )
+    return _PREDICTORS[name]

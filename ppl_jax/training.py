@@ -20,9 +20,10 @@ import jax.numpy as jnp
 
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.gates import gate, shared_gate
 from ppl_jax.interaction import Learner, make_steps, summarise
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import predict, selected_transition
+from ppl_jax.predictors import predict, predictor
 from ppl_jax.types import DecisionPoint, Env, Expert
 
 PyTree = Any
@@ -82,7 +83,11 @@ def make_train(
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
-    transition = selected_transition(env, config.predictor)
+    predicted_transition = predictor(config.predictor).make(env)
+    decide_takeover = algorithm.decide or shared_gate(config.gate, env.spec.observation_scale)
+    compares = algorithm.needs_expert_rollout or (
+        algorithm.decide is None and gate(config.gate).needs_expert_rollout
+    )
     init, sample_novice_action, query_expert, interact, _, learn = make_steps(
         env, expert, algorithm, config, params
     )
@@ -90,10 +95,10 @@ def make_train(
     check_rounds(algorithm, config)
     density = getattr(expert, "log_density", None)
     if density is None:
-        if config.gate == "action_probability":
+        if algorithm.decide is None and gate(config.gate).needs_density:
             raise ValueError(
-                "gate 'action_probability' needs an expert with a density, such as a neural one: give one, "
-                "or another gate"
+                f"gate {config.gate!r} needs an expert with a density, such as a neural one: "
+                "give one, or another gate"
             )
         density = lambda observation, action: jnp.nan  # noqa: E731
 
@@ -102,6 +107,10 @@ def make_train(
         key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
         observation = env.observe(learner.env_state, params)
         action = sample_novice_action(learner, key_propose, observation)
+
+        def transition(*args: Any) -> Any:
+            return predicted_transition(*args, learner.hparams.predictor)
+
         roll = functools.partial(
             predict,
             env,
@@ -111,9 +120,9 @@ def make_train(
             action,
             params,
             config.prediction_horizon,
-            observe=algorithm.needs_expert_rollout,
+            observe=compares,
         )
-        asked_again = config.gate_rollout == "closed_loop" or algorithm.needs_expert_rollout
+        asked_again = config.gate_rollout == "closed_loop" or compares
         act = functools.partial(algorithm.act, learner.algorithm, key_act)
         point = DecisionPoint(
             observation=observation,
@@ -121,10 +130,10 @@ def make_train(
             expert_action=query_expert(learner, key_expert, observation),
             takeover=learner.takeover,
             trajectory=roll(act=act if asked_again else None),
-            experts=roll(expert=expert) if algorithm.needs_expert_rollout else None,
+            experts=roll(expert=expert) if compares else None,
             log_density=jnp.asarray(density(observation, jnp.clip(action, -1.0, 1.0))),
         )
-        return algorithm.decide(learner.algorithm, point, learner.hparams)
+        return decide_takeover(learner.algorithm, point, learner.hparams)
 
     def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
         learner, _ = interact(learner, started)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
 import numpy as np
 
+from ppl_jax.cards import EnvCard
+
 PyTree = Any
 
 
 @flax.struct.dataclass
 class StepInfo:
-    """What a step tells beside reward and ends; a fixed struct for every world.
+    """Step information beyond reward and termination; one struct for every environment.
 
     Attributes:
         cost: Safety cost of the step, >= 0.
@@ -40,8 +42,8 @@ class Outcome:
     Attributes:
         reward, cost, progress, speed: Scalars (see `StepInfo`).
         terminated, truncated, success, unsafe: Booleans.
-        physics_diverged: The physics gave a value that is not finite; the state is the one before, and the
-            episode ends here.
+        physics_diverged: The physics gave a value that is not finite; the state is the one before,
+            and the episode ends here.
     """
 
     reward: jax.Array
@@ -64,7 +66,8 @@ class Trajectory:
         reward, speed: Of each predicted step.
         unsafe, success, terminated: Booleans.
         valid: The step was made: the prediction had not ended before it.
-        expert_actions: [H, A] the expert's action at each predicted state, where it was asked, else None.
+        expert_actions: [H, A] the expert's action at each predicted state, where it was asked, else
+            None.
         position: [H, P] where each predicted state is, where that was asked, else None.
     """
 
@@ -81,7 +84,7 @@ class Trajectory:
 
 @flax.struct.dataclass
 class Interaction:
-    """One environment step as an algorithm gets to store it.
+    """One environment step, as passed to `Algorithm.store`.
 
     Attributes:
         observation, next_observation: [O]; the latter before any automatic reset.
@@ -110,7 +113,7 @@ class Interaction:
 
 @flax.struct.dataclass
 class DecisionPoint:
-    """What is known where it is decided who acts for the next steps.
+    """Inputs to the takeover decision.
 
     Attributes:
         observation: [O].
@@ -149,11 +152,11 @@ class PreferenceBatch:
 
 
 class EnvSpec(NamedTuple):
-    """What a network has to know of a world.
+    """Sizes of an environment, and how a network sees its observation.
 
     Attributes:
         observation_size, action_size: O and A.
-        observation_mean, observation_scale: [O] constants of the world; a network sees
+        observation_mean, observation_scale: [O] constants of the environment; a network sees
             `(observation - mean) / scale`.
     """
 
@@ -163,13 +166,24 @@ class EnvSpec(NamedTuple):
     observation_scale: np.ndarray
 
 
-class Env(Protocol):
-    """A world. All methods are pure; write for one world and `vmap` outside.
+Expert = Callable[[jax.Array, PyTree, jax.Array, PyTree], jax.Array]
+"""`expert(key, state, observation [O], params) -> action [A]`; pure."""
 
-    `params` is a traced struct; `default_params` is for training, `held_out_params` for
-    evaluation. Scenarios of `params` are numbered `0 .. scenario_count(params) - 1`. `sequential_on_cpu`:
-    on a CPU a batch of worlds is no faster than one after another, so that an evaluation had better
-    leave out those whose episode has ended.
+Transition = Callable[[jax.Array, PyTree, jax.Array, PyTree], tuple[PyTree, Outcome]]
+"""`transition(key, state, action [A], params) -> (state, outcome)`; pure."""
+
+
+class Env(Protocol):
+    """An environment. All methods are pure; write them for one environment and `vmap` outside.
+
+    Attributes:
+        name: As in results and on the command line.
+        spec: Sizes and scaling of observation and action.
+        max_episode_steps: Time limit.
+        sequential_on_cpu: On a CPU a batch of environments is no faster than one after another, so
+            an evaluation should skip those whose episode has ended.
+        default_params, held_out_params: Traced structs to train on and to evaluate on. Scenarios of
+            either are numbered `0 .. scenario_count(params) - 1`.
     """
 
     name: str
@@ -178,6 +192,21 @@ class Env(Protocol):
     sequential_on_cpu: bool
     default_params: PyTree
     held_out_params: PyTree
+
+    @property
+    def experts(self) -> Mapping[str, Expert]:
+        """Experts by name ("scripted", ...); empty where there is none."""
+        ...
+
+    @property
+    def predictors(self) -> Mapping[str, Transition]:
+        """Prediction steps by name: "simulator" (the true transition), "kinematic", ..."""
+        ...
+
+    @property
+    def card(self) -> EnvCard:
+        """Facts that are known without building it."""
+        ...
 
     def reset(self, key: jax.Array, params: PyTree) -> tuple[jax.Array, PyTree]:
         """A random start: (observation [O], state)."""
@@ -189,6 +218,14 @@ class Env(Protocol):
 
     def scenario_count(self, params: PyTree) -> int:
         """Number of scenarios in `params`."""
+        ...
+
+    def scenario_numbers(self, params: PyTree) -> jax.Array:
+        """Number that results name each scenario by, [S]."""
+        ...
+
+    def readings(self, state: PyTree) -> list[tuple[str, str]]:
+        """Figures of a concrete state to show a person, as (label, text)."""
         ...
 
     def transition(
@@ -206,10 +243,3 @@ class Env(Protocol):
     ) -> tuple[jax.Array, PyTree, jax.Array, jax.Array, jax.Array, StepInfo]:
         """One step with automatic reset: (obs, state, reward, terminated, truncated, info)."""
         ...
-
-
-Expert = Callable[[jax.Array, PyTree, jax.Array, PyTree], jax.Array]
-"""`expert(key, state, observation [O], params) -> action [A]`; pure."""
-
-Transition = Callable[[jax.Array, PyTree, jax.Array, PyTree], tuple[PyTree, Outcome]]
-"""`transition(key, state, action [A], params) -> (state, outcome)`; pure."""

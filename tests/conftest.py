@@ -41,6 +41,6 @@ def robosuite_recordings():
 @pytest.fixture(scope="session")
 def world():
     """A small driving world that tests share, so that compiled functions are shared too."""
-    from envs.driving.env import make_driving
+    from envs.driving.make import make_driving
 
     return make_driving(training=range(100, 106), held_out=range(1000, 1006))

@@ -1,4 +1,11 @@
-"""Probe worlds with known answers, as small as they can be."""
+"""Shared by tests: probe environments with known answers, tiny settings, programs from outside."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import flax.struct
 import jax
@@ -6,7 +13,45 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment
+from ppl_jax import algorithms, checkpoint, gates, predictors
+from ppl_jax.config import HParams, TrainConfig, replace, values
 from ppl_jax.types import EnvSpec, Outcome
+
+ROOT = Path(__file__).parent.parent
+TINY = {
+    "total_steps": 800,
+    "batch_size": 32,
+    "hidden": (32,),
+    "prediction_horizon": 6,
+    "decision_interval": 5,
+    "max_preference_horizon": 6,
+    "human_capacity": 2000,
+    "preference_capacity": 2000,
+    "members": 3,
+    "rollout_steps": 100,
+}
+OWN = {
+    "bc": {"total_steps": 200, "demonstrations": 200, "offline_updates": 400},
+    "gail": {"total_steps": 8200, "demonstrations": 200},
+    "iwr": {"demonstrations": 40, "offline_updates": 50},
+    "ensemble_dagger": {"demonstrations": 40, "offline_updates": 100},
+    "thrifty_dagger": {"demonstrations": 40, "offline_updates": 100},
+}
+
+PROGRAM = """
+import envs
+from experiments.cli import main
+from ppl_jax.algorithms import register
+from tests.helpers import Probe
+
+def broken(spec, config):
+    raise ValueError("this method is broken")
+
+envs.register("probe", Probe)
+register("broken", broken)
+if __name__ == "__main__":
+    main()
+"""
 
 
 @flax.struct.dataclass
@@ -38,9 +83,6 @@ class Probe(Environment):
 
     def scenario_count(self, params):
         return params.signs.shape[0]
-
-    def scenario_numbers(self, params):
-        return jnp.arange(params.signs.shape[0])
 
     def reset_to(self, index, key, params):
         return ProbeState(params.signs[index], jnp.zeros(()), jnp.zeros((), jnp.int32))
@@ -81,7 +123,7 @@ class Aim(Probe):
 
     def transition(self, key, state, action, params):
         state, outcome = super().transition(key, state, action, params)
-        return state, outcome.replace(reward=1.0 + outcome.reward)
+        return state, dataclasses.replace(outcome, reward=1.0 + outcome.reward)
 
 
 @flax.struct.dataclass
@@ -102,9 +144,6 @@ class Goal(Environment):
 
     def scenario_count(self, params):
         return params.signs.shape[0]
-
-    def scenario_numbers(self, params):
-        return jnp.arange(params.signs.shape[0])
 
     def reset_to(self, index, key, params):
         return GoalState(params.signs[index], jnp.zeros((), jnp.int32))
@@ -177,7 +216,7 @@ class Spend(Goal):
 
     def transition(self, key, state, action, params):
         a, yes = action[0], jnp.ones((), bool)
-        return state.replace(time=state.time + 1), Outcome(
+        return dataclasses.replace(state, time=state.time + 1), Outcome(
             reward=2.0 * a,
             terminated=yes,
             truncated=~yes,
@@ -223,7 +262,7 @@ class Toll(TwoSteps):
 
     def transition(self, key, state, action, params):
         state, outcome = super().transition(key, state, action, params)
-        return state, outcome.replace(cost=1.0 * (state.time == 1))
+        return state, dataclasses.replace(outcome, cost=1.0 * (state.time == 1))
 
 
 class Endless(TwoSteps):
@@ -238,7 +277,82 @@ class Endless(TwoSteps):
     def transition(self, key, state, action, params):
         state, outcome = super().transition(key, state, action, params)
         no = jnp.zeros((), bool)
-        outcome = outcome.replace(
-            reward=jnp.ones(()), terminated=no, truncated=state.time >= self.max_episode_steps
+        outcome = dataclasses.replace(
+            outcome,
+            reward=jnp.ones(()),
+            terminated=no,
+            truncated=state.time >= self.max_episode_steps,
         )
         return state, outcome
+
+
+def plain_settings(name, **changes):
+    """(config, hparams) of a method with the classes' own defaults, and some changed by name."""
+    chosen = {k: changes[k] for k in ("gate", "predictor") if k in changes}
+    spec = algorithms.method(name)
+    config = TrainConfig(**chosen, method=spec.config())
+    hparams = HParams(
+        method=spec.hparams(),
+        gate=gates.gate(config.gate).hparams(),
+        predictor=predictors.predictor(config.predictor).hparams(),
+    )
+    return replace(config, hparams, **changes)
+
+
+def tiny_settings(name, **changes):
+    """The same, tiny."""
+    config, hparams = plain_settings(name, **{k: changes[k] for k in changes if k == "gate"})
+    known = values(config, hparams)
+    tiny = {k: v for k, v in TINY.items() if k in known}
+    return plain_settings(name, **(tiny | changes))
+
+
+def probe_settings(name, **changes):
+    """A method's settings, tiny, with some changed."""
+    chosen = {k: changes[k] for k in ("gate", "predictor") if k in changes}
+    config, _ = tiny_settings(name, **chosen, **OWN.get(name, {}))
+    _, hparams = algorithms.settings(name, "probe", **chosen)
+    known = values(config, hparams)
+    faster = {
+        "learning_rate": 3e-3,
+        "discriminator_rate": 1e-3,
+        "polyak_tau": 0.02,
+        "survival_correction": 1.0,  # success ends the episode in these worlds
+    }
+    config, hparams = replace(config, hparams, **{k: v for k, v in faster.items() if k in known})
+    others = {k for k in TINY if k not in known}  # what only other methods have
+    return replace(config, hparams, **{k: v for k, v in changes.items() if k not in others})
+
+
+def outcome(out):
+    """What a run folder holds, less times."""
+    newest = out / "checkpoints" / f"step_{checkpoint.steps(out / 'checkpoints')[-1]}"
+    lines = (out / "metrics.jsonl").read_text().splitlines()
+    return {
+        "learner": json.loads((newest / "checksum.json").read_text())["crc32"],
+        "evaluation": (out / "evaluation.csv").read_text(),
+        "metrics": [
+            {k: v for k, v in json.loads(line).items() if not k.startswith("time/")}
+            for line in lines
+        ],
+    }
+
+
+def program(tmp_path, *words, code=0):
+    """Run the command line in a program that registers the probe and a broken method."""
+    script = tmp_path / "own.py"
+    script.write_text(PROGRAM)
+    return call(script, *words, code=code)
+
+
+def call(script, *words, code=0):
+    """Run a script from outside the package; its exit code must be `code`."""
+    done = subprocess.run(
+        [sys.executable, str(script), *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=560,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done

@@ -1,10 +1,9 @@
-"""The driving world: reset, transition, observation, and how one is built."""
+"""Driving: reset, transition, observation, and pools of scenarios."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import flax.struct
@@ -26,8 +25,6 @@ from envs.driving.geometry import (
     to_body,
     touches_sidewalk,
 )
-from envs.driving.maps import MapSettings, generate
-from envs.driving.recorded import load_recordings
 from envs.driving.scenario import (
     SPAWN_LONG,
     Capacity,
@@ -39,8 +36,6 @@ from envs.driving.scenario import (
 )
 from ppl_jax.types import EnvSpec, Expert, Outcome
 
-TRAINING_SCENARIOS = range(100, 150)
-HELD_OUT_SCENARIOS = range(1000, 1050)
 HORIZON = 1500  # steps of 0.1 s
 CONTACT_MARGIN = 0.04  # m: closer than this counts as touching, as in the simulator
 _COASTING = 0.364  # m/s^2: 4 wheels, 2 N s per 0.02 s, 1100 kg
@@ -282,23 +277,27 @@ class Driving(Environment):
     spec = EnvSpec(obs.SIZE, 2, obs.MEAN, obs.SCALE)
     max_episode_steps = HORIZON
 
-    def __init__(self, default_params: DrivingParams, held_out_params: DrivingParams):
+    def __init__(
+        self,
+        default_params: DrivingParams,
+        held_out_params: DrivingParams,
+        experts: Mapping[str, Expert],
+    ):
+        """Hold the pools of scenarios and the experts.
+
+        Args:
+            default_params, held_out_params: Scenarios to train on and to evaluate on.
+            experts: By name; "scripted" is the usual one.
+        """
         self.default_params = default_params
         self.held_out_params = held_out_params
+        self.experts = experts
+        self.predictors = {"simulator": self.transition, "kinematic": self.transition_kinematic}
 
     @property
     def scripted_expert(self) -> Expert:
-        """The world's default expert."""
-        from envs.driving.expert import scripted_expert
-
-        return scripted_expert
-
-    @property
-    def demonstrator(self) -> Expert:
-        """The expert that a neural one learns from first."""
-        from envs.driving.expert import cautious_expert
-
-        return cautious_expert
+        """The expert "scripted"."""
+        return self.experts["scripted"]
 
     def scenario_numbers(self, params: DrivingParams) -> jax.Array:
         """Numbers of the pool's scenarios, [S]."""
@@ -448,37 +447,3 @@ def make_params(
         if isinstance(field.default, float)
     }
     return DrivingParams(scenarios=pool, starts=starts, start_observations=observations, **weights)
-
-
-def make_driving(
-    scenarios: str | Path | None = None,
-    held_out_scenarios: str | Path | None = None,
-    settings: MapSettings | None = None,
-    training: Sequence[int] = TRAINING_SCENARIOS,
-    held_out: Sequence[int] = HELD_OUT_SCENARIOS,
-) -> Driving:
-    """Build the driving world.
-
-    Args:
-        scenarios: Folder of recorded scenarios to train on; generated ones where None.
-        held_out_scenarios: Folder of recorded scenarios to evaluate on; those of `scenarios`
-            where None and `scenarios` is given.
-        settings: Of generated maps.
-        training, held_out: Numbers of the generated scenarios.
-
-    Raises:
-        ValueError: If a folder is missing or holds no recording.
-    """
-    settings = settings or MapSettings()
-    if scenarios is not None:
-        train = load_recordings(scenarios)
-    else:
-        train = [generate(number, settings) for number in training]
-    if held_out_scenarios is not None:
-        evaluate = load_recordings(held_out_scenarios)
-    elif scenarios is not None:
-        evaluate = train
-    else:
-        evaluate = [generate(number, settings) for number in held_out]
-    capacity = Capacity.of([*train, *evaluate])
-    return Driving(make_params(train, capacity), make_params(evaluate, capacity))

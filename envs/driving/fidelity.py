@@ -30,6 +30,7 @@ from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import vehicle
 from envs.driving.geometry import lane_coordinates, on_lanes
+from envs.driving.make import make_driving
 from envs.driving.recorded import load_recording, recording_paths
 from envs.driving.scenario import Capacity, Scenario, pack
 
@@ -282,7 +283,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     expert = folder / _EXPERT_FILE
     figures["expert_success"] = (
-        success_rate(recorded_expert(expert), driving.make_driving()) if expert.exists() else None
+        success_rate(recorded_expert(expert), make_driving()) if expert.exists() else None
     )
     print(json.dumps(figures, indent=2))
     return 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import flax.struct
 import jax
@@ -19,6 +19,9 @@ from envs.driving.roads import DECORATION, EXTEND, SHRINK, Lane, Road, RoadNetwo
 SIDEWALK = (0.2, 2.2)  # m beyond the outer lane edge: where the sidewalk starts and ends
 SPAWN_LONG = 5.0  # m along its lane at which the ego starts
 _FAR = 1e6  # m, where padding lies
+
+
+T = TypeVar("T")
 
 
 @flax.struct.dataclass
@@ -291,8 +294,8 @@ def stack(scenarios: Sequence[Scenario]) -> Scenario:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
 
 
-def tree_index(pool: Scenario, index: jax.Array) -> Scenario:
-    """The scenario at `index` of a pool."""
+def tree_index(pool: T, index: jax.Array | int) -> T:
+    """The entry at `index` of structs that are stacked along their leaves' first axis."""
     return jax.tree.map(lambda leaf: leaf[index], pool)
 
 

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.compiler import set_xla_flags
+from envs.manipulation.make import make_nut_assembly, make_table_wiping
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import frames
 from envs.manipulation.scenes.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, WIPING_BASE
@@ -36,8 +37,8 @@ from envs.manipulation.tasks import nut, wiping
 
 FREE_STEPS, WINDOW = 20, 10
 _LONGEST = 250  # steps that a compiled replay holds; longer recordings are replayed in parts
-_WIPING = wiping.make_table_wiping(range(1), range(1))
-_NUT = nut.make_nut_assembly(range(1), range(1))
+_WIPING = make_table_wiping(range(1), range(1))
+_NUT = make_nut_assembly(range(1), range(1))
 _KEY = jax.random.key(0)
 
 

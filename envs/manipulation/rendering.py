@@ -1,4 +1,4 @@
-"""Pictures of the manipulation worlds, through MuJoCo's offscreen renderer.
+"""Pictures of the arm environments, through MuJoCo's offscreen renderer.
 
 The predicted path of the grip site is drawn red where the expert would take over and green where
 not; the expert's own is blue, as in driving. Shadows and reflections are off: they cost more than
@@ -14,23 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.manipulation.physics.mujoco_c import NutTwin, WipingTwin, make_twin
+from envs.manipulation.twins import DrawnScene, NutTwin, WipingTwin, make_twin
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
-CAMERAS = {
-    "table_wiping": {
-        "lookat": (0.05, 0.0, 0.95),
-        "distance": 1.55,
-        "azimuth": 215,
-        "elevation": -38,
-    },
-    "nut_assembly": {
-        "lookat": (0.0, -0.08, 0.95),
-        "distance": 1.25,
-        "azimuth": 150,
-        "elevation": -28,
-    },
-}
 _WIDTH = 0.004  # m, of a drawn path
 
 
@@ -80,13 +66,13 @@ def choose_backend() -> None:
 
 
 class ArmScene:
-    """A world ready to be drawn again and again."""
+    """An environment ready to be drawn again and again."""
 
     def __init__(self, env: Any, size: tuple[int, int] = (300, 400), smooth: bool = True):
         """Make the renderer, in the thread that is to draw.
 
         Args:
-            env: The world.
+            env: The environment.
             size: Height and width, pixels.
             smooth: Edges without steps; half of the time goes there where no GPU draws.
         """
@@ -94,13 +80,13 @@ class ArmScene:
         import mujoco
 
         self.mujoco = mujoco
-        self.twin: WipingTwin | NutTwin = make_twin(env)
+        self.twin: WipingTwin | NutTwin | DrawnScene = make_twin(env)
         self.model, self.data = self.twin.arm.model, self.twin.arm.data
         if not smooth:
             self.model.vis.quality.offsamples = 0
         self.renderer = _renderer(mujoco, self.model, *size)
         self.camera = mujoco.MjvCamera()
-        for field, value in CAMERAS[env.name].items():
+        for field, value in env.card.camera.items():
             setattr(self.camera, field, value)
         self.options = mujoco.MjvOption()
         self.options.geomgroup[3] = 0  # what is only felt

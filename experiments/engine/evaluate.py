@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make, pretrained
+from envs import pretrained
+from envs.registry import make
 from experiments.engine.policy_file import load_meta, load_policy
 from experiments.engine.run_folder import EVALUATION, POLICY, RunFolder
 from experiments.engine.runtime import UserError
@@ -163,7 +164,7 @@ def named_expert(name: str, env: Env) -> Expert:
         UserError: If there is none, or the file cannot be used.
     """
     if name == "scripted":
-        expert = getattr(env, "scripted_expert", None)
+        expert = env.experts.get("scripted")
         if expert is None:
             raise UserError(f"expert: {env.name} has no scripted expert, give a policy file")
         return expert

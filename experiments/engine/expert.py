@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs import known, unknown
+from envs.registry import known, unknown
 from experiments.engine.evaluate import (
     EvaluationRow,
     evaluate_policy,
@@ -165,9 +165,8 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     config, folder = settings.config, RunFolder(out)
     env = make_env_and_expert(settings)
     try:
-        scripted = getattr(env, "scripted_expert", None)
-        shown_by = getattr(env, "demonstrator", scripted)
-        functions = make_ppo_lagrangian(env, config, expert=shown_by)
+        teacher = env.experts.get(env.card.expert.teacher)
+        functions = make_ppo_lagrangian(env, config, expert=teacher)
     except ValueError as error:
         raise UserError(str(error)) from error
     open_folder(folder, settings.as_json(), resume)
@@ -296,7 +295,7 @@ def evaluate_expert(env: Env, kind: str) -> list[EvaluationRow]:
     """
     if kind != "scripted":
         return evaluate_policy(env, named_policy(kind, env), 0)
-    scripted = getattr(env, "scripted_expert", None)
+    scripted = env.experts.get("scripted")
     if scripted is None:
         raise UserError(f"kind: {env.name} has no scripted expert, give neural or a policy file")
     episodes = evaluate(env, scripted, env.held_out_params, jax.random.key(0))

@@ -56,14 +56,14 @@ def recorded_functions(
         ValueError: If the method plays by itself.
     """
     columns, _ = recording.load(path)
-    rows = recording.interactions(columns, env, config.max_preference_horizon)
-    have = len(rows.reward)
+    have = len(columns[recording.EPISODE])
     if config.total_steps > have:
         raise UserError(
             f"total_steps must not exceed the recording's {have}, got {config.total_steps}"
         )
-    rows = jax.tree.map(jnp.asarray, rows)
     live = make_live(env, make_algorithm, config)
+    rows = recording.interactions(columns, env, live.algorithm.predicted_steps)
+    rows = jax.tree.map(jnp.asarray, rows)
     algorithm = live.algorithm
     if algorithm.update_every > 1:
         raise ValueError(f"algorithm {algorithm.name} plays by itself: a recording cannot teach it")

@@ -17,7 +17,6 @@ exported session is one file of the same columns. All are [T] or [T, ...]:
 from __future__ import annotations
 
 import json
-import os
 import warnings
 import zipfile
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from experiments.engine.files import write_atomic
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
 from ppl_jax.types import Env, Interaction, Trajectory
@@ -123,10 +123,7 @@ def _pieces(folder: Path) -> list[Path]:
 
 
 def _write(path: Path, columns: dict[str, Any]) -> None:
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        np.savez_compressed(file, **columns)
-    os.replace(part, path)
+    write_atomic(path, lambda file: np.savez_compressed(file, **columns))
 
 
 def load(path: Path) -> tuple[Columns, dict[str, Any]]:

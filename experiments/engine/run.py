@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs import known, unknown
 from experiments.engine.evaluate import (
     arrays_of,
     evaluate_policy,
@@ -29,113 +28,14 @@ from experiments.engine.progress import Progress
 from experiments.engine.recorded import recorded_functions, recording_of
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError, device, revision, versions
+from experiments.engine.settings import RunSettings, check, one_level
 from ppl_jax import algorithms, checkpoint, experts
-from ppl_jax.config import HParams, TrainConfig, validate
+from ppl_jax.config import TrainConfig
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.interaction import Learner
-from ppl_jax.losses import NEEDS_REFERENCE
+from ppl_jax.interaction import Counters, Learner
 from ppl_jax.networks import Layers
 from ppl_jax.training import Phase, TrainFunctions, make_train, phases
 from ppl_jax.types import Env, Expert
-
-EVALUATE_EVERY = 1000  # steps
-
-
-@dataclasses.dataclass(frozen=True)
-class RunSettings:
-    """Everything that defines a run; config.json holds it.
-
-    Attributes:
-        env, algorithm, seed: What is trained.
-        config, hparams: Static and traced settings.
-        expert: "scripted", "neural" (the shipped one), a policy file, "person" (see
-            `experiments.ui`) or "recorded PATH" of such a session.
-        reference_policy: Policy file of the objectives that have a reference.
-        scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
-        evaluate_on: "held_out" or (to choose settings by) "training".
-        evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
-    """
-
-    env: str
-    algorithm: str
-    seed: int
-    config: TrainConfig
-    hparams: HParams
-    expert: str = "scripted"
-    reference_policy: str | None = None
-    scenarios: str | None = None
-    held_out_scenarios: str | None = None
-    evaluate_every: int = EVALUATE_EVERY
-    evaluate_on: str = "held_out"
-
-    def as_json(self) -> dict[str, Any]:
-        """For config.json."""
-        return {
-            "env": self.env,
-            "algorithm": self.algorithm,
-            "seed": self.seed,
-            "expert": self.expert,
-            "reference_policy": self.reference_policy,
-            "scenarios": self.scenarios,
-            "held_out_scenarios": self.held_out_scenarios,
-            "evaluate_every": self.evaluate_every,
-            "evaluate_on": self.evaluate_on,
-            "config": dataclasses.asdict(self.config),
-            "hparams": {k: float(v) for k, v in dataclasses.asdict(self.hparams).items()},
-        }
-
-    @staticmethod
-    def from_json(content: dict[str, Any]) -> RunSettings:
-        """The inverse of `as_json`; ignores what else config.json holds."""
-        config = dict(content["config"])
-        config["hidden"] = tuple(config["hidden"])
-        return RunSettings(
-            env=content["env"],
-            algorithm=content["algorithm"],
-            seed=content["seed"],
-            config=TrainConfig(**config),
-            hparams=HParams(**content["hparams"]),
-            expert=content["expert"],
-            reference_policy=content["reference_policy"],
-            scenarios=content["scenarios"],
-            held_out_scenarios=content["held_out_scenarios"],
-            evaluate_every=content["evaluate_every"],
-            evaluate_on=content["evaluate_on"],
-        )
-
-
-def check(settings: RunSettings) -> None:
-    """Refuse what cannot work, before anything is built.
-
-    Raises:
-        UserError: One line naming field, value and what is allowed.
-    """
-    if not known(settings.env):
-        raise UserError(unknown(settings.env))
-    if settings.seed < 0:
-        raise UserError(f"seed must not be negative, got {settings.seed}")
-    interval = settings.config.decision_interval
-    try:
-        algorithms.method(settings.algorithm)
-        validate(settings.config, settings.hparams)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    if settings.evaluate_every < 1 or settings.evaluate_every % interval:
-        raise UserError(
-            f"evaluate_every must be a positive multiple of decision_interval ({interval}), got "
-            f"{settings.evaluate_every}"
-        )
-    needs = settings.config.objective in NEEDS_REFERENCE
-    if needs and settings.reference_policy is None:
-        raise UserError(
-            f"objective {settings.config.objective!r} needs a reference policy: give "
-            "--reference-policy FILE, a policy trained by --algorithm bc, for one"
-        )
-    if settings.reference_policy is not None and (settings.algorithm != "ppl" or not needs):
-        raise UserError(
-            f"reference_policy is for ppl with objective {' or '.join(NEEDS_REFERENCE)}, got "
-            f"{settings.algorithm} with {settings.config.objective}"
-        )
 
 
 def make_env_and_expert(settings: RunSettings) -> tuple[Env, Expert]:
@@ -218,8 +118,8 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
         if done >= plan[-1].end:
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
-    runner = _Runner(settings, folder, env, functions)
     with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
+        runner = _Runner(settings, folder, env, functions, progress)
         waiting = [chunk for chunk in plan if chunk.end > done]
         runner.compile(learner, waiting[-1])
         progress.start()
@@ -301,12 +201,14 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
             before = folder.config()
         except ValueError as error:
             raise UserError(str(error)) from error
-        for name, value in content.items():
-            if before.get(name) != json.loads(json.dumps(value)):
-                raise UserError(
-                    f"cannot resume {str(folder.path)!r}: its {name} is {before.get(name)!r}, "
-                    f"asked for {value!r}"
-                )
+        held, asked = one_level(before), one_level(json.loads(json.dumps(content)))
+        differing = [
+            f"{name} is {held.get(name)!r}, asked for {value!r}"
+            for name, value in asked.items()
+            if name != "schema" and held.get(name) != value
+        ]
+        if differing:
+            raise UserError(f"cannot resume {str(folder.path)!r}: its {'; its '.join(differing)}")
         return
     try:
         folder.create(
@@ -321,8 +223,53 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
         raise UserError(str(error)) from error
 
 
+_OLD_HPARAMS = (  # of a learner's checkpoint before config.json had a schema
+    "preference_horizon",
+    "beta",
+    "bc_weight",
+    "preference_weight",
+    "preference_bias",
+    "prediction_noise",
+    "expert_noise",
+    "learning_rate",
+    "min_speed",
+    "min_return",
+    "max_departure",
+    "min_log_density",
+    "discount",
+    "target_rate",
+    "margin",
+    "conservative_weight",
+    "max_doubt",
+    "max_discrepancy",
+    "switch_rate",
+    "discriminator_rate",
+    "survival_correction",
+)
+_OLD_COUNTERS = {"physics_diverged": "broken"}
+
+
 def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
-    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none."""
+    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none.
+
+    A checkpoint from before config.json had a schema holds settings and counters under other names.
+    """
+    if "hparams" in folder.config() and hasattr(learner, "counters"):
+        names = {f.name: _OLD_COUNTERS.get(f.name, f.name) for f in dataclasses.fields(Counters)}
+        old = dataclasses.replace(
+            learner,
+            hparams={name: jax.numpy.zeros((), jax.numpy.float32) for name in _OLD_HPARAMS},
+            counters={before: getattr(learner.counters, name) for name, before in names.items()},
+        )
+        done, found = _restore(folder, old)
+        if found is old:
+            return 0, learner
+        counters = Counters(**{name: found.counters[before] for name, before in names.items()})
+        return done, dataclasses.replace(found, hparams=learner.hparams, counters=counters)
+    return _restore(folder, learner)
+
+
+def _restore(folder: RunFolder, learner: Any) -> tuple[int, Any]:
 
     def warn(line: str) -> None:
         print(f"warning: {line}", file=sys.stderr)
@@ -337,9 +284,15 @@ class _Runner:
     """Compiled functions of a run and what happens between its chunks."""
 
     def __init__(
-        self, settings: RunSettings, folder: RunFolder, env: Env, functions: TrainFunctions
+        self,
+        settings: RunSettings,
+        folder: RunFolder,
+        env: Env,
+        functions: TrainFunctions,
+        progress: Progress,
     ):
         self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
+        self.progress = progress
         self.compile_s = self.train_s = 0.0
         self.trained_steps = 0
         self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
@@ -354,7 +307,9 @@ class _Runner:
 
             began = time.perf_counter()
             jitted = jax.jit(run, donate_argnums=0)
-            self.programs[kind] = jitted.lower(learner).compile()
+            what = f"{self.settings.algorithm} in {self.settings.env}, {chunk.phase}"
+            with self.progress.compiling(what, f"{what}, {chunk.length} steps"):
+                self.programs[kind] = jitted.lower(learner).compile()
             self.compile_s += time.perf_counter() - began
         return self.programs[kind]
 

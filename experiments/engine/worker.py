@@ -39,12 +39,14 @@ class Worker:
     def _run(self, job: Job) -> Reply:
         import jax
 
-        from ppl_jax.config import HParams
+        from experiments.engine.settings import RunSettings
+        from ppl_jax.config import replace
         from ppl_jax.sweep import split, stack
 
         batch = job["runs"]
         seeds = [run["seed"] for run in batch]
-        hparams = [HParams(**run["hparams"]) for run in batch]
+        settings = RunSettings.from_json(job["settings"])
+        hparams = [replace(settings.config, settings.hparams, **run["hparams"])[1] for run in batch]
         keys = jax.vmap(jax.random.key)(np.array(seeds, np.uint32))
         traced = (keys, stack(hparams))
         if job["side_by_side"]:
@@ -66,7 +68,8 @@ class Worker:
         """The compiled batch of these settings, its world, and the seconds that took just now."""
         import jax
 
-        from experiments.engine.run import RunSettings, algorithm_factory, make_env_and_expert
+        from experiments.engine.run import algorithm_factory, make_env_and_expert
+        from experiments.engine.settings import RunSettings
         from ppl_jax.sweep import make_batch, make_run
         from ppl_jax.training import make_train
 
@@ -87,7 +90,7 @@ class Worker:
 def _rows(job: Job, curve: Any, numbers: Any) -> Reply:
     """One run's rows: one per evaluation, and one per scenario of the last evaluation."""
     from experiments.engine.evaluate import rows_of
-    from experiments.engine.run import RunSettings
+    from experiments.engine.settings import RunSettings
     from ppl_jax.evaluation import Episodes
     from ppl_jax.sweep import evaluation_steps
 

@@ -4,7 +4,7 @@
     python own_method.py compare driving --algorithms ppl focused --seeds 3
 
 "focused" is HG-DAgger that listens to the expert most where it errs most: a sample weighs its
-squared error to the power `preference_weight`, a setting that the method reads as its own.
+squared error to the power `focus`, a setting of its own: `--focus 0.5`, and an axis of sweeps.
 Everything else (gate, phases, resume, evaluation, tables, vmap over seeds) comes with the loop.
 """
 
@@ -19,7 +19,7 @@ from ppl_jax import buffers
 from ppl_jax.algorithms import Algorithm, register
 from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
-from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.fields import setting
 from ppl_jax.losses import bc_loss
 from ppl_jax.networks import layers, make_policy
 
@@ -30,6 +30,13 @@ class State:
 
     learned: Learned
     human_buffer: RingBuffer
+
+
+@flax.struct.dataclass
+class FocusedHParams:
+    """The method's own traced settings."""
+
+    focus: jax.Array | float = setting(0.5, "Power of the error in a sample's weight.", low=0)
 
 
 def make_focused(spec, config):
@@ -54,7 +61,7 @@ def make_focused(spec, config):
         def loss(params):
             mean = policy.apply(params, observation)
             error = jax.lax.stop_gradient(jnp.sum((mean - action) ** 2, -1))
-            weight = (error + 1e-6) ** hparams.preference_weight
+            weight = (error + 1e-6) ** hparams.method.focus
             return bc_loss(mean, action, weight=weight / jnp.mean(weight))
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params)
@@ -66,15 +73,13 @@ def make_focused(spec, config):
         name="focused",
         init=init,
         act=act,
-        decide=make_gate(config.gate, spec.observation_scale),  # the gate all methods share
         store=store,
         update=update,
         policy=lambda state: layers(state.learned.average),  # what is evaluated and exported
-        needs_expert_rollout=config.gate in COMPARING,
     )
 
 
-register("focused", make_focused, {"preference_weight": 0.5})  # its own defaults, if any
+register("focused", make_focused, hparams=FocusedHParams)
 
 if __name__ == "__main__":
     main()

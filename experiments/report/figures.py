@@ -6,21 +6,32 @@ many seeds, and in which units.
 
 from __future__ import annotations
 
-import csv
 import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from experiments.engine.runtime import UserError
-from experiments.report.points import Point, at_step, read_points
+from experiments.engine.runtime import UserError, need
+from experiments.report.points import (
+    NOTHING,
+    SEEDS,
+    Frame,
+    Point,
+    at_step,
+    common_over,
+    describe,
+    known,
+    read_csv,
+    read_points,
+)
+from experiments.report.tables import show
+from ppl_jax.statistics import Interval, mean_interval
 
-if TYPE_CHECKING:
-    from experiments.cli import Figure
-
+KINDS = ("curves", "axis", "heatmap", "training", "experts", "steering", "horizon")
+SHARES = ("success", "progress")
 NAMES = {
     "success": "held-out success",
     "progress": "held-out share of the task done",
@@ -40,40 +51,74 @@ MARKERS, DASHES = "osD^vP*Xph", ["-", "--", "-.", ":"]
 _OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
 
 
-def figure(command: Figure) -> None:
-    """Draw what was asked for.
+def figure(
+    results: Path,
+    *,
+    other: Sequence[Path] = (),
+    kind: str | None = None,
+    column: str = "success",
+    steps: Sequence[int] = (),
+    scenario: int = 1000,
+    out: Path = Path("figure.png"),
+) -> None:
+    """`ppl figure`: draw results.
+
+    Args:
+        results: Run folder, folder of several runs, a file of theirs, a folder of experts' cards,
+            or (kind steering) a policy file.
+        other: Kind steering: more policies; kind horizon: results over L, to show beside.
+        kind: One of `KINDS` (default: what the results have).
+        column: What is drawn.
+        steps: Kind axis: steps to draw (default: the end of each run).
+        scenario: Kind steering: number of a held-out scenario.
+        out: Picture to write; its ending decides how.
 
     Raises:
-        UserError: If the results do not have it.
+        UserError: If the results do not have it, or matplotlib is missing.
     """
-    if command.kind == "steering":
+    known("column", column, list(NAMES))
+    if kind is not None:
+        known("kind", kind, KINDS)
+    need("matplotlib", "plot", "ppl figure")
+    if kind == "steering":
         from experiments.report.steering import steering
 
-        steering([command.results, *command.other], command.scenario, command.out)
-        return
-    if command.kind == "horizon":
-        what_horizons_cost(command.results, command.other, command.out)
-        return
-    if command.other:
+        return steering([results, *other], scenario, out)
+    if kind == "horizon" or (kind is None and _is_measured(results)):
+        return what_horizons_cost(results, other, out)
+    if other:
         raise UserError("more than one path is for --kind steering and horizon alone")
-    cards = command.results.is_dir() and bool(list(command.results.glob("*.npz")))
-    if command.kind == "experts" or (command.kind is None and cards):
-        expert_curves(command.results, command.out)
-        return
-    points = read_points(command.results)
+    if kind == "experts" or (kind is None and _cards(results)):
+        return expert_curves(results, out)
+    points = read_points(results)
+    if not points:
+        raise UserError(f"{str(results)!r}: no run finished, every one failed or diverged")
     several = _varied(points)
-    kind = command.kind or {0: "curves", 1: "axis", 2: "heatmap"}.get(len(several), "curves")
-    if kind == "curves":
-        curves(points, command.out, command.column)
-    elif kind == "training":
-        training(points, command.out)
-    elif len(several) != (need := {"axis": 1, "heatmap": 2}[kind]):
+    kind = kind or {0: "curves", 1: "axis", 2: "heatmap"}.get(len(several), "curves")
+    wanted = {"axis": 1, "heatmap": 2}.get(kind)
+    if wanted is not None and len(several) != wanted:
         what = ", ".join(several) or "none"
-        raise UserError(f"kind {kind} needs results over {need} settings, these have {what}")
+        raise UserError(f"kind {kind} needs results over {wanted} settings, these have {what}")
+    if kind == "curves":
+        curves(points, out, column)
+    elif kind == "training":
+        training(points, out)
     elif kind == "axis":
-        over_axis(points, several[0], command.out, command.column, command.steps)
+        over_axis(points, several[0], out, column, steps=steps)
     else:
-        heatmap(points, several, command.out, command.column)
+        heatmap(points, several, out, column)
+
+
+def _cards(folder: Path) -> list[Path]:
+    """Curves of experts in a folder: a NAME.csv with a NAME.json each."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.glob("*.csv") if path.with_suffix(".json").is_file())
+
+
+def _is_measured(path: Path) -> bool:
+    """Whether a file is one of `ppl horizon`."""
+    return path.is_file() and "predicted_step" in read_csv(path)
 
 
 def _varied(points: Sequence[Point]) -> list[str]:
@@ -83,9 +128,7 @@ def _varied(points: Sequence[Point]) -> list[str]:
 
 
 def _canvas(rows: int, columns: int, size: tuple[float, float]) -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
+    need("matplotlib", "plot", "a figure").use("Agg")
     from matplotlib import pyplot
 
     return pyplot.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
@@ -106,19 +149,38 @@ def _plain(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _seeds(points: Sequence[Point]) -> str:
-    counts = sorted({len(point.seeds) for point in points})
-    return f"n = {' to '.join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))} seeds"
+def _styles(count: int) -> list[dict[str, Any]]:
+    """A style for each of some lines: no colour twice, and other dashes and markers."""
+    import matplotlib
+
+    if count <= 10:
+        colours = [f"C{i}" for i in range(count)]
+    else:
+        colours = [matplotlib.colormaps["turbo"](x) for x in np.linspace(0.03, 0.97, count)]
+    return [
+        {
+            "color": colour,
+            "marker": MARKERS[i % len(MARKERS)],
+            "linestyle": DASHES[i % len(DASHES)],
+            "markersize": 5,
+            "markerfacecolor": "white" if i % 2 else colour,
+        }
+        for i, colour in enumerate(colours)
+    ]
 
 
-def _style(i: int) -> dict[str, Any]:
-    return {
-        "color": f"C{i % 10}",
-        "marker": MARKERS[i % len(MARKERS)],
-        "linestyle": DASHES[i % len(DASHES)],
-        "markersize": 5,
-        "markerfacecolor": "white" if i % 2 else f"C{i % 10}",
-    }
+def _legend(axes: Any, count: int) -> None:
+    """To the right of a panel, in as many columns as it takes."""
+    columns = -(-count // 18)
+    axes.legend(
+        frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), ncols=columns
+    )
+
+
+def _stack(intervals: Sequence[Interval]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, low and high ends of intervals, [points] each."""
+    mean, low, high = np.array(intervals, float).T
+    return mean, low, high
 
 
 def _lines(points: Sequence[Point]) -> dict[str, list[Point]]:
@@ -131,103 +193,134 @@ def _lines(points: Sequence[Point]) -> dict[str, list[Point]]:
     return {name: sorted(mine, key=lambda point: point.step) for name, mine in found.items()}
 
 
-def curves(points: Sequence[Point], out: Path, column: str) -> None:
+def curves(points: Sequence[Point], out: Path, column: str = "success") -> None:
     """A column against steps and against human data, one line per method and setting."""
-    picture, ((by_step, by_human),) = _canvas(1, 2, (11, 4.6))
-    for i, (name, mine) in enumerate(_lines(points).items()):
-        found = [point.interval(column) for point in mine]
-        mean, low, high = (np.array(part) for part in zip(*found, strict=True))
-        human = [point.measured["human_data_usage"].mean() for point in mine]
-        style = _style(i)
-        if mine[0].algorithm in _OFFLINE:  # another axis altogether: its end alone
+    lines = _lines(points)
+    over = common_over(points)
+    picture, ((by_step, by_human),) = _canvas(1, 2, (11 + 2.4 * (len(lines) // 18), 4.6))
+    for (name, mine), style in zip(lines.items(), _styles(len(lines)), strict=True):
+        mean, low, high = _stack([point.interval(column, over) for point in mine])
+        counted = all("human_data_usage" in point.measured for point in mine)
+        human = [point.measured["human_data_usage"].mean() for point in mine] if counted else []
+        if mine[0].algorithm in _OFFLINE and counted:  # another axis altogether: its end alone
             bar = [[mean[-1] - low[-1]], [high[-1] - mean[-1]]]
             by_human.errorbar(human[-1], mean[-1], bar, **style, label=name)
             continue
         steps = [point.step for point in mine]
         by_step.plot(steps, mean, **style, label=name)
         by_step.fill_between(steps, low, high, color=style["color"], alpha=0.12, linewidth=0)
-        by_human.plot(human, mean, **style, label=name)
+        by_human.plot(human, mean if counted else [], **style, label=name)
     by_step.set(xlabel="environment steps", ylabel=NAMES[column])
     by_human.set(xlabel="steps under the expert's control", xscale="log")
     for axes in (by_step, by_human):
         _plain(axes)
-        if column in ("success", "progress"):
+        if column in SHARES:
             axes.set_ylim(0, 1.02)
-    by_human.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _finish(picture, f"Means with 95% bootstrap intervals, {_seeds(points)}.", out)
+    _legend(by_human, len(lines))
+    _finish(picture, f"Means with {describe(points, over)}.", out)
 
 
 def over_axis(
-    points: Sequence[Point], name: str, out: Path, column: str, steps: Sequence[int]
+    points: Sequence[Point], name: str, out: Path, column: str, *, steps: Sequence[int] = ()
 ) -> None:
     """A column over the values of one setting, one line per method and step."""
     envs = list(dict.fromkeys(point.env for point in points))
     picture, (row,) = _canvas(1, len(envs), (1.5 + 4.6 * len(envs), 4.6))
+    drawn: list[Point] = []
     for axes, env in zip(row, envs, strict=True):
         mine = [point for point in points if point.env == env]
         wanted = steps or sorted({point.step for point in at_step(mine, None)})
-        values = list(dict.fromkeys(point.values[name] for point in mine))
-        i = 0
-        for algorithm in dict.fromkeys(point.algorithm for point in mine):
-            for step in wanted:
-                here = {
-                    point.values[name]: point.interval(column)
-                    for point in at_step(mine, step)
-                    if point.algorithm == algorithm
-                }
-                at = [x for x, value in enumerate(values) if value in here]
-                mean, low, high = (
-                    np.array(part) for part in zip(*(here[values[x]] for x in at), strict=True)
-                )
-                shifted = np.array(at) + 0.06 * i
-                label = f"{algorithm}, {step:,} steps"
-                bars = [mean - low, high - mean]
-                axes.errorbar(shifted, mean, bars, capsize=3, label=label, **_style(i))
-                i += 1
-        axes.set_xticks(range(len(values)), values)
+        here = [point for step in wanted for point in at_step(mine, step)]
+        _axis_panel(axes, here, name, column)
         axes.set(xlabel=SETTINGS.get(name, name), ylabel=NAMES[column], title=env)
-        if column in ("success", "progress"):
-            axes.set_ylim(0, 1.02)
-        _plain(axes)
-        axes.legend(frameon=False, fontsize=8, loc="best")
-    _finish(picture, f"Means with 95% bootstrap intervals over seeds, {_seeds(points)}.", out)
+        drawn += here
+    _finish(picture, f"Means with {describe(drawn, common_over(drawn))}.", out)
+
+
+def _axis_panel(axes: Any, points: Sequence[Point], name: str, column: str) -> None:
+    """One world: a column over a setting."""
+    values = list(dict.fromkeys(point.values[name] for point in points))
+    if all(_is_number(point, name) for point in points):
+        values.sort(key=float)
+    pairs = [(point.algorithm, point.step) for point in points]
+    lines = sorted(set(pairs), key=pairs.index)
+    over = common_over(points)
+    for i, ((algorithm, step), style) in enumerate(zip(lines, _styles(len(lines)), strict=True)):
+        here = {
+            point.values[name]: point.interval(column, over)
+            for point in points
+            if (point.algorithm, point.step) == (algorithm, step)
+        }
+        at = [x for x, value in enumerate(values) if value in here]
+        mean, low, high = _stack([here[values[x]] for x in at])
+        bars = [mean - low, high - mean]
+        label = f"{algorithm}, {step:,} steps"
+        axes.errorbar(np.array(at) + 0.06 * i, mean, bars, capsize=3, label=label, **style)
+    axes.set_xticks(range(len(values)), values)
+    if column in SHARES:
+        axes.set_ylim(0, 1.02)
+    _plain(axes)
+    axes.legend(frameon=False, fontsize=8, loc="best")
 
 
 def heatmap(points: Sequence[Point], names: Sequence[str], out: Path, column: str) -> None:
-    """A column over the values of two settings, one panel per world and method; figures inside."""
+    """A column over the values of two settings, one panel per world and method; figures inside.
+
+    Colours of a share run from 0 to 1, those of another column over the values shown.
+    """
     points = at_step(points, None)
     panels = list(dict.fromkeys((point.env, point.algorithm) for point in points))
     picture, (row,) = _canvas(1, len(panels), (1.2 + 4.4 * len(panels), 4.4))
-    every = [point.measured[column].mean() for point in points]
+    every = [float(point.measured[column].mean()) for point in points]
+    scale = (0.0, 1.0) if column in SHARES else (min(every), max(every))
+    drawn = None
     for axes, (env, algorithm) in zip(row, panels, strict=True):
         mine = [point for point in points if (point.env, point.algorithm) == (env, algorithm)]
-        across, down = (list(dict.fromkeys(p.values[name] for p in mine)) for name in names)
-        grid = np.full((len(down), len(across)), np.nan)
-        for point in mine:
-            x, y = across.index(point.values[names[0]]), down.index(point.values[names[1]])
-            interval = point.interval(column)
-            grid[y, x] = interval.mean
-            bright = (interval.mean - min(every)) / max(max(every) - min(every), 1e-9)
-            text = f"{interval.mean:.2f}\n[{interval.low:.2f}, {interval.high:.2f}]"
-            colour = "black" if bright > 0.5 else "white"
-            axes.text(x, y, text, ha="center", va="center", fontsize=8, color=colour)
-        drawn = axes.imshow(grid, cmap="cividis", vmin=min(every), vmax=max(every), aspect="auto")
-        axes.set_xticks(range(len(across)), across)
-        axes.set_yticks(range(len(down)), down)
-        axes.set(xlabel=SETTINGS.get(names[0], names[0]), ylabel=SETTINGS.get(names[1], names[1]))
+        drawn = _heat_panel(axes, mine, names, column, scale=scale)
         axes.set_title(" ".join(part for part in (env, algorithm) if part))
-    picture.colorbar(drawn, ax=row, label=NAMES[column])
+    label = NAMES[column]
+    if column not in SHARES:
+        label += f" (colours from {scale[0]:.3g} to {scale[1]:.3g})"
+    picture.colorbar(drawn, ax=row, label=label)
     steps = sorted({point.step for point in points})
-    caption = f"Means over {_seeds(points)} with 95% bootstrap intervals, after "
-    _finish(picture, caption + " or ".join(f"{step:,}" for step in steps) + " steps.", out)
+    after = " or ".join(f"{step:,}" for step in steps)
+    caption = f"Means with {describe(points, common_over(points))}, after {after} steps."
+    _finish(picture, caption, out)
+
+
+def _heat_panel(
+    axes: Any,
+    points: Sequence[Point],
+    names: Sequence[str],
+    column: str,
+    *,
+    scale: tuple[float, float],
+) -> Any:
+    """One world and method; returns the image, for the colour bar."""
+    across, down = (list(dict.fromkeys(p.values[name] for p in points)) for name in names)
+    grid = np.full((len(down), len(across)), np.nan)
+    over = common_over(points)
+    for point in points:
+        x, y = across.index(point.values[names[0]]), down.index(point.values[names[1]])
+        interval = point.interval(column, over)
+        grid[y, x] = interval.mean
+        bright = (interval.mean - scale[0]) / max(scale[1] - scale[0], 1e-9)
+        text = show(interval, 2).replace(" [", "\n[")
+        colour = "black" if bright > 0.5 else "white"
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, color=colour)
+    axes.set_xticks(range(len(across)), across)
+    axes.set_yticks(range(len(down)), down)
+    axes.set(xlabel=SETTINGS.get(names[0], names[0]), ylabel=SETTINGS.get(names[1], names[1]))
+    return axes.imshow(grid, cmap="cividis", vmin=scale[0], vmax=scale[1], aspect="auto")
 
 
 def training(points: Sequence[Point], out: Path) -> None:
     """Share of steps under the expert and cost per 1,000 steps, between evaluations."""
     if any("training_cost" not in point.measured for point in points):
         raise UserError("kind training needs results of ppl sweep, which count cost in training")
-    picture, ((rate, cost),) = _canvas(1, 2, (11, 4.6))
-    for i, (name, mine) in enumerate(_lines(points).items()):
+    lines = _lines(points)
+    picture, ((rate, cost),) = _canvas(1, 2, (11 + 2.4 * (len(lines) // 18), 4.6))
+    for (name, mine), style in zip(lines.items(), _styles(len(lines)), strict=True):
         steps = np.array([0] + [point.step for point in mine])
         middle, length = (steps[1:] + steps[:-1]) / 2, np.diff(steps)
         for axes, column, unit in (
@@ -236,20 +329,17 @@ def training(points: Sequence[Point], out: Path) -> None:
         ):
             totals = np.stack([point.measured[column] for point in mine])
             spent = np.diff(totals, axis=0, prepend=0) / length[:, None] * unit
-            found = [
-                Point("", "", {}, 0, mine[0].seeds, {column: row}).interval(column) for row in spent
-            ]
-            mean, low, high = (np.array(part) for part in zip(*found, strict=True))
-            axes.plot(middle, mean, **_style(i), label=name)
-            axes.fill_between(middle, low, high, color=f"C{i % 10}", alpha=0.12, linewidth=0)
+            mean, low, high = _stack([mean_interval(row[:, None]) for row in spent])
+            axes.plot(middle, mean, **style, label=name)
+            axes.fill_between(middle, low, high, color=style["color"], alpha=0.12, linewidth=0)
     rate.set(xlabel="environment steps", ylabel="share of steps under the expert's control")
     cost.set(xlabel="environment steps", ylabel="cost per 1,000 training steps")
     for axes in (rate, cost):
         axes.set_ylim(bottom=0)
         _plain(axes)
-    cost.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    caption = "Between evaluations; means with 95% bootstrap intervals over seeds, "
-    _finish(picture, f"{caption}{_seeds(points)}.", out)
+    _legend(cost, len(lines))
+    over = SEEDS if any(len(point.seeds) > 1 for point in points) else NOTHING
+    _finish(picture, f"Between evaluations; means with {describe(points, over)}.", out)
 
 
 def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> None:
@@ -263,33 +353,47 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
     Raises:
         UserError: If the files are others.
     """
-    try:
-        with open(measured, newline="") as file:
-            rows = [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
-    except OSError as error:
-        raise UserError(str(error)) from error
-    if not rows or "predicted_step" not in rows[0]:
+    if not _is_measured(measured):
         raise UserError(f"{str(measured)!r} is no file of `ppl horizon`")
-    stops = sorted({row["step"] for row in rows})
-    at = sorted({row["predicted_step"] for row in rows})
-    seeds = len({row["seed"] for row in rows})
-    picture, (panels,) = _canvas(1, 3 + bool(results), (4.2 * (3 + bool(results)), 4.4))
+    frame = read_csv(measured)
+    names = ["seed", "step", "predicted_step", "drift", "coverage", "gap", "error"]
+    frame = frame[names].astype(float)
+    seeds = frame["seed"].nunique()
+    # one row per predicted step, one column per measured value and training step
+    mean = frame.pivot_table(index="predicted_step", columns="step", values=names[3:])
+    count = 3 + bool(results)
+    picture, (panels,) = _canvas(1, count, (4.2 * count, 4.4))
+    _drift_panels(panels, mean)
+    for path in results:
+        _led_to(panels[3], read_points(path))
+    for axes in panels:
+        _plain(axes)
+        axes.legend(frameon=False, fontsize=8)
+        axes.set_xticks(mean.index)
+        if axes is not panels[-1] or not results:
+            axes.set_ylim(bottom=0)
+    caption = (
+        f"Where the novice alone would be taken over; means over n = {seeds} seeds, without "
+        "intervals. gap(L) = 1 - reach_L / reach_M; error(L) = drift_L / |a_h - a_n|."
+    )
+    if results:
+        led = [point for path in results for point in read_points(path)]
+        caption += f" Success: means with {describe(led, SEEDS)}."
+    _finish(picture, caption, out)
 
-    def mean(column: str, stop: float) -> np.ndarray:
-        return np.array(
-            [
-                np.mean([r[column] for r in rows if (r["predicted_step"], r["step"]) == (i, stop)])
-                for i in at
-            ]
-        )
 
-    for i, stop in enumerate(stops):
-        style = _style(i) | {"label": f"after {stop:,.0f} steps"}
-        panels[0].plot(at, mean("drift", stop), **style)
-        panels[1].plot(at, mean("coverage", stop), **style)
-    gap, error = (np.mean([mean(c, stop) for stop in stops], 0) for c in ("gap", "error"))
-    panels[2].plot(at, gap, **_style(0), label="gap(L)")
-    panels[2].plot(at, error, **_style(1), label="error(L)")
+def _drift_panels(panels: Any, mean: Frame) -> None:
+    """Drift, coverage and their balance over the predicted steps."""
+    stops = mean["drift"].columns
+    at = mean.index.to_numpy()
+    for stop, style in zip(stops, _styles(len(stops)), strict=True):
+        style = style | {"label": f"after {stop:,.0f} steps"}
+        panels[0].plot(at, mean["drift"][stop], **style)
+        panels[1].plot(at, mean["coverage"][stop], **style)
+    gap, error = (mean[name].mean(axis=1).to_numpy() for name in ("gap", "error"))
+    first, second = _styles(2)
+    panels[2].plot(at, gap, **first, label="gap(L)")
+    panels[2].plot(at, error, **second, label="error(L)")
     best = at[int(np.argmin(np.maximum(gap, error)))]
     panels[2].axvline(best, color="black", linewidth=0.8, linestyle=":")
     panels[2].set(xlabel="preference horizon L (steps)", title=f"balanced at L = {best:.0f}")
@@ -298,32 +402,21 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
     panels[1].set(xlabel="preference horizon L (steps)", title="states visited, states preferred")
     panels[1].set_ylabel("mean distance to the nearest, scaled observation")
     panels[2].set_ylabel("share of its worst")
-    for column, _ in enumerate(results):
-        points = read_points(results[column])
-        for i, step in enumerate(sorted({point.step for point in points})):
-            here = [p for p in points if p.step == step and _is_number(p, "preference_horizon")]
-            if not here:
-                continue
-            x = [float(p.values["preference_horizon"]) for p in here]
-            found = [p.interval("success") for p in here]
-            middle, low, high = (np.array(part) for part in zip(*found, strict=True))
-            bars = [middle - low, high - middle]
-            label = f"{here[0].algorithm}, {step:,} steps"
-            panels[3].errorbar(x, middle, bars, capsize=3, label=label, **_style(i))
-        panels[3].set(xlabel="preference horizon L (steps)", title="what it led to")
-        panels[3].set_ylabel(NAMES["success"])
-        panels[3].set_ylim(0, 1.02)
-    for axes in panels:
-        _plain(axes)
-        axes.legend(frameon=False, fontsize=8)
-        axes.set_xticks(at)
-        if axes is not panels[-1] or not results:
-            axes.set_ylim(bottom=0)
-    caption = (
-        f"Where the novice alone would be taken over; means over n = {seeds} seeds. gap(L) = 1 - "
-        "reach_L / reach_M; error(L) = drift_L / |a_h - a_n|. Success: 95% bootstrap intervals."
-    )
-    _finish(picture, caption, out)
+
+
+def _led_to(axes: Any, points: Sequence[Point]) -> None:
+    """Success over L, a line per step."""
+    points = [point for point in points if _is_number(point, "preference_horizon")]
+    steps = sorted({point.step for point in points})
+    for step, style in zip(steps, _styles(len(steps)), strict=True):
+        here = [point for point in points if point.step == step]
+        x = [float(point.values["preference_horizon"]) for point in here]
+        mean, low, high = _stack([point.interval("success", SEEDS) for point in here])
+        label = f"{here[0].algorithm}, {step:,} steps"
+        axes.errorbar(x, mean, [mean - low, high - mean], capsize=3, label=label, **style)
+    axes.set(xlabel="preference horizon L (steps)", title="what it led to")
+    axes.set_ylabel(NAMES["success"])
+    axes.set_ylim(0, 1.02)
 
 
 def _number(value: str) -> float:
@@ -347,40 +440,44 @@ def expert_curves(folder: Path, out: Path) -> None:
     Raises:
         UserError: If there is none.
     """
-    paths = sorted(path for path in folder.glob("*.csv") if path.with_suffix(".json").is_file())
+    paths = _cards(folder)
     if not paths:
         raise UserError(f"{str(folder)!r} holds no cards of `ppl expert card`")
     picture, rows = _canvas(len(paths), 3, (11, 2.6 * len(paths) + 0.4))
-    for (success, cost, multiplier), path in zip(rows, paths, strict=True):
-        limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
-        with open(path, newline="") as file:
-            table = [
-                {k: float(v) if v else np.nan for k, v in row.items()}
-                for row in csv.DictReader(file)
-            ]
-        steps = np.array([row["step"] for row in table]) / 1e6
-
-        def line(axes: Any, column: str, label: str, style: str, steps=steps, table=table) -> None:
-            axes.plot(steps, [row[column] for row in table], style, label=label)
-
-        line(success, "held_out_success_rate", "held out, without noise", "-")
-        line(success, "train_success_rate", "in training, with noise", ":")
-        success.set_ylim(0, 1.03)
-        success.set_ylabel(f"{path.stem}\nsuccess")
-        line(cost, "held_out_episodic_cost", "held out", "-")
-        line(cost, "train_episodic_cost", "in training", ":")
-        cost.axhline(limit, color="black", linewidth=0.8, linestyle="--", label="limit")
-        if max(row["held_out_episodic_cost"] for row in table) > 10:
-            cost.set_yscale("symlog", linthresh=1)
-        cost.set_ylim(bottom=0)
-        cost.set_ylabel("cost per episode")
-        line(multiplier, "train_multiplier", "multiplier", "-")
-        multiplier.set_ylabel("multiplier")
-        multiplier.set_ylim(bottom=0)
-        for axes in (success, cost, multiplier):
-            _plain(axes)
+    for row, path in zip(rows, paths, strict=True):
+        _expert_row(row, path)
     for axes in rows[-1]:
         axes.set_xlabel("environment steps, millions")
     rows[0][0].legend(frameon=False)
     rows[0][1].legend(frameon=False)
-    _finish(picture, "One seed each; held out: 50 scenarios, each once.", out)
+    caption = "One seed each, without intervals; held out: 50 scenarios, each once."
+    _finish(picture, caption, out)
+
+
+def _expert_row(panels: Any, path: Path) -> None:
+    """Success, cost and multiplier over one expert's training."""
+    import pandas as pd
+
+    limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
+    frame: Frame = pd.read_csv(path)
+    steps = frame["step"] / 1e6
+    success, cost, multiplier = panels
+    for axes, column, label, dash in (
+        (success, "held_out_success_rate", "held out, without noise", "-"),
+        (success, "train_success_rate", "in training, with noise", ":"),
+        (cost, "held_out_episodic_cost", "held out", "-"),
+        (cost, "train_episodic_cost", "in training", ":"),
+        (multiplier, "train_multiplier", "multiplier", "-"),
+    ):
+        axes.plot(steps, frame[column], dash, label=label)
+    success.set_ylim(0, 1.03)
+    success.set_ylabel(f"{path.stem}\nsuccess")
+    cost.axhline(limit, color="black", linewidth=0.8, linestyle="--", label="limit")
+    if frame["held_out_episodic_cost"].max() > 10:
+        cost.set_yscale("symlog", linthresh=1)
+    cost.set_ylim(bottom=0)
+    cost.set_ylabel("cost per episode")
+    multiplier.set_ylabel("multiplier")
+    multiplier.set_ylim(bottom=0)
+    for axes in panels:
+        _plain(axes)

@@ -14,11 +14,11 @@ import numpy as np
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import make_world, named_expert, run_options
-from experiments.engine.runtime import UserError
-from ppl_jax.config import default
-from ppl_jax.gates import RULES
+from experiments.engine.runtime import UserError, need
+from ppl_jax import algorithms
+from ppl_jax.gates import gate
 from ppl_jax.predictors import predict
-from ppl_jax.types import Env, Expert
+from ppl_jax.types import DecisionPoint, Env, Expert
 
 SUFFIXES = (".gif", ".mp4", ".png")
 
@@ -43,6 +43,9 @@ def render(run: str, number: int, out: Path, steps: int, world: str = "driving")
         raise UserError(f"out must end in {', '.join(SUFFIXES)}, got {str(out)!r}")
     if steps < 1:
         raise UserError(f"steps must be at least 1, got {steps}")
+    need("PIL", "render", "ppl render")
+    if out.suffix == ".mp4":
+        need("av", "render", "ppl render to .mp4")
     named = run in ("scripted", "neural")
     name, options = (world, {}) if named else run_options(Path(run))
     env = make_world(name, options)
@@ -59,8 +62,8 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
-    config, hparams = default(env.name)
-    rule, key = RULES[config.gate], jax.random.key(0)
+    config, hparams = algorithms.settings("ppl", env.name)
+    rule, key = gate(config.gate), jax.random.key(0)
     state = env.reset_to(jnp.int32(numbers.index(number)), key, params)
     if env.name == "driving":
         place, picture = _driving(env, state)
@@ -74,9 +77,18 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
         novice = ahead(state, action, params, horizon)
-        expert = ahead(state, action, params, horizon, expert=env.scripted_expert)
+        expert = ahead(state, action, params, horizon, expert=env.experts["scripted"])
         after, outcome = env.transition(key, state, action, params)
-        takeover = rule(novice, None, hparams, env.spec.observation_scale)
+        point = DecisionPoint(
+            observation=env.observe(state, params),
+            novice_action=action,
+            expert_action=action,
+            takeover=jnp.zeros((), bool),
+            trajectory=novice,
+            experts=None,
+            log_density=jnp.asarray(jnp.nan),
+        )
+        takeover = rule.decide(point, hparams.gate, env.spec.observation_scale)
         return after, outcome, novice.position, takeover, expert.position
 
     frames = []
@@ -102,6 +114,7 @@ def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
 
 
 def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
+    need("mujoco", "manipulation", f"drawing {env.name}")
     try:
         from envs.manipulation.rendering import ArmPaths, ArmScene
 

@@ -53,7 +53,8 @@ METHODS: dict[str, dict[str, Reported]] = {
     },
 }
 
-# "ablation, MetaDrive, neural expert, 10K total"; names are those of `experiments.studies.ablation.ROWS`
+# "ablation, MetaDrive, neural expert, 10K total"; names as in
+# `experiments.studies.ablation.ROWS`
 ABLATION: dict[str, Reported] = {
     "imitation on a+": Reported("1.9K", "10K", "0.36", None, "0.65"),
     "random a+": Reported("2.2K", "10K", "0.45", None, "0.73"),

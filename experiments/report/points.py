@@ -1,40 +1,44 @@
-"""Result files as groups of runs, and `ppl table`: Markdown, LaTeX or plain text from them."""
+"""Result files as groups of runs, and the intervals that tables, figures and notebooks share."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY
 from experiments.engine.runtime import UserError
-from experiments.report import paper
-from experiments.report.tables import RESULTS, print_table
-from ppl_jax.statistics import (
-    Interval,
-    interquartile_interval,
-    mean_interval,
-    paired_difference,
-    probability_of_improvement,
-)
+from experiments.engine.settings import RENAMED, RENAMED_VALUES
+from ppl_jax.algorithms import settings as default_settings
+from ppl_jax.config import did_you_mean
+from ppl_jax.config import values as setting_values
+from ppl_jax.statistics import Interval, mean_interval, paired_difference
 
-if TYPE_CHECKING:
-    from experiments.cli import Table
-
-MEASURED = (
-    "human_data_usage",
-    "takeovers",
-    "training_cost",
-    "success",
-    "episodic_return",
-    "progress",
-    "episodic_cost",
-    "length",
-)
+Frame: TypeAlias = Any  # pandas.DataFrame: pandas is imported when it is used
+RESULTS, EPISODES = "results.csv", "episodes.csv"
+SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
+COUNTS = ("human_data_usage", "takeovers", "training_cost")
+MEASURED = (*COUNTS, *SCORES)
 _NOT_SETTINGS = {"run", "env", "algorithm", "seed", "status", "step", "total_steps", *MEASURED}
+_NOT_SETTINGS |= {"scenario", "engine", "wall_s", "compile_s"}
+BOTH, SEEDS, SCENARIOS, NOTHING = "seeds and scenarios", "seeds", "scenarios", ""
+
+
+def known(name: str, value: str, allowed: Sequence[str]) -> None:
+    """Refuse a name that is not among the allowed ones, with the nearest that is.
+
+    Raises:
+        UserError: One line.
+    """
+    if value not in allowed:
+        listed = ", ".join(repr(one) for one in allowed)
+        raise UserError(
+            f"{name} must be one of {listed}, got {value!r}{did_you_mean(value, allowed)}"
+        )
 
 
 @dataclasses.dataclass
@@ -42,10 +46,12 @@ class Point:
     """Runs with the same settings at one step.
 
     Attributes:
-        env, algorithm, step: What and when.
+        env, algorithm, step: World, method and environment steps.
         values: Settings that differ between runs of the same world and method.
         seeds: Of the runs, sorted.
         measured: Column -> [seeds] values; columns that the file lacks are missing.
+        episodes: Column -> [seeds, scenarios], where there is a row per scenario; else empty.
+        scenarios: Their numbers, or none.
     """
 
     env: str
@@ -54,15 +60,87 @@ class Point:
     step: int
     seeds: list[int]
     measured: dict[str, np.ndarray]
+    episodes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    scenarios: list[int] = dataclasses.field(default_factory=list)
 
     @property
     def label(self) -> str:
         """Of a row."""
         return " ".join([self.algorithm, *(f"{k}={v}" for k, v in self.values.items())])
 
-    def interval(self, column: str) -> Interval:
-        """Mean over seeds with its 95% interval."""
-        return mean_interval(self.measured[column][:, None], np.random.default_rng(0))
+    @property
+    def over(self) -> str:
+        """What intervals are over: seeds and scenarios as far as the files have them."""
+        several = len(self.seeds) > 1
+        if self.scenarios:
+            return BOTH if several else SCENARIOS
+        return SEEDS if several else NOTHING
+
+    def scores(self, column: str, over: str | None = None) -> np.ndarray:
+        """Values of a column, [seeds, scenarios], or [seeds, 1] where intervals are over seeds."""
+        known("column", column, list(self.measured))
+        wanted = self.over if over is None else over
+        if wanted in (BOTH, SCENARIOS) and column in self.episodes:
+            return self.episodes[column]
+        return self.measured[column][:, None]
+
+    def interval(self, column: str, over: str | None = None) -> Interval:
+        """Mean with its 95% interval over what `over` says (default: all there is)."""
+        return mean_interval(self.scores(column, over))
+
+
+def difference(ours: Point, theirs: Point, column: str = "success") -> Interval | None:
+    """Mean of `ours - theirs`, paired by seed and, where both have them, by scenario.
+
+    `ppl table`, `ppl compare` and notebooks all call this one: the same runs, the same interval.
+
+    Returns:
+        None where no seed is common to both.
+    """
+    both = sorted(set(ours.seeds) & set(theirs.seeds))
+    if not both:
+        return None
+    same = bool(ours.scenarios) and ours.scenarios == theirs.scenarios
+    rows = []
+    for point in (ours, theirs):
+        at = [point.seeds.index(seed) for seed in both]
+        rows.append(point.scores(column, BOTH if same else SEEDS)[at])
+    return paired_difference(*rows)
+
+
+def common_over(points: Sequence[Point]) -> str | None:
+    """What intervals of one picture are all over; None where each point keeps its own."""
+    kinds = {point.over for point in points}
+    return SEEDS if kinds == {BOTH, SEEDS} else None
+
+
+def describe(points: Sequence[Point], over: str | None = None) -> str:
+    """A sentence that says what the intervals of these points are over."""
+    found: dict[str, list[str]] = {}
+    for point in points:
+        kind = point.over if over is None else over
+        seeds, scenarios = f"{len(point.seeds)} seeds", f"{len(point.scenarios)} held-out scenarios"
+        text = {
+            BOTH: f"over {seeds} and {scenarios}",
+            SEEDS: f"over {seeds}",
+            SCENARIOS: f"over {scenarios} of one seed (other seeds are not in them)",
+            NOTHING: "not given for one seed without a row per scenario",
+        }[kind]
+        found.setdefault(text, []).append(point.label)
+    if len(found) == 1:
+        return f"95% bootstrap intervals {next(iter(found))}"
+    parts = [
+        f"{text} ({', '.join(dict.fromkeys(labels))})"
+        if len(found) < 4 and len(labels) < 6
+        else text
+        for text, labels in found.items()
+    ]
+    return "95% bootstrap intervals " + "; ".join(parts)
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder is that of a single run."""
+    return (path / CONFIG).is_file() and not (path / RESULTS).is_file()
 
 
 def results_path(path: Path) -> Path:
@@ -73,52 +151,186 @@ def results_path(path: Path) -> Path:
     """
     found = path / RESULTS if path.is_dir() else path
     if not found.is_file():
-        raise UserError(f"{str(path)!r} is neither a results file nor a folder with {RESULTS}")
+        raise UserError(
+            f"{str(path)!r} is neither a results file nor a folder with {RESULTS}, nor a run folder"
+        )
     return found
 
 
-def read_points(path: Path) -> list[Point]:
-    """Everything in a results file, in its order; runs that failed or diverged are left out.
+def read_csv(path: Path) -> Frame:
+    """A CSV file with every cell as text; an index column that pandas wrote is dropped.
 
     Raises:
-        UserError: If the file is none of `ppl sweep`, `compare` or `ablation`.
+        UserError: If it cannot be read.
     """
-    with open(results_path(path), newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not {"algorithm", "seed", "step", "success"} <= set(rows[0]):
-        raise UserError(f"{str(path)!r} holds no results of ppl sweep, compare or ablation")
-    rows = [row for row in rows if row.get("status", "done") == "done"]
-    axes = _axes(rows)
-    found: dict[tuple, list[dict[str, str]]] = {}
-    for row in rows:
-        where = (row.get("env", ""), row["algorithm"])
-        values = tuple((name, row[name]) for name in axes[where])
-        found.setdefault((*where, values, int(row["step"])), []).append(row)
+    import pandas as pd
+
+    try:
+        frame: Frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except (OSError, ValueError) as error:  # pandas' parsing errors are ValueErrors
+        raise UserError(f"{str(path)!r} cannot be read: {error}") from error
+    frame = frame.loc[:, [not str(name).startswith("Unnamed:") for name in frame.columns]]
+    frame = frame.rename(columns=RENAMED)
+    for column, renamed in RENAMED_VALUES.items():
+        if column in frame:
+            frame[column] = frame[column].replace(renamed)
+    return frame
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write dictionaries as a CSV file; the first one names the columns."""
+    import pandas as pd
+
+    frame = pd.DataFrame(list(rows), columns=list(rows[0]), dtype=object)
+    frame.to_csv(path, index=False, lineterminator="\n")
+
+
+def _read_run(path: Path) -> Frame:
+    """The evaluations of a single run, a row per step and scenario."""
+    if not (path / EVALUATION).is_file():
+        raise UserError(f"run {str(path)!r} has no {EVALUATION} yet: nothing was evaluated")
+    try:
+        config = json.loads((path / CONFIG).read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{str(path / CONFIG)!r} cannot be read: {error}") from error
+    frame = read_csv(path / EVALUATION)
+    for name in ("env", "algorithm", "seed"):
+        frame[name] = str(config.get(name, ""))
+    if (path / SUMMARY).is_file():
+        summary = json.loads((path / SUMMARY).read_text())
+        if "training_cost" in summary:
+            last = frame["step"].astype(float) == float(summary["total_steps"])
+            frame["training_cost"] = np.where(last, f"{summary['training_cost']:g}", "")
+    return frame
+
+
+def read_frame(path: Path) -> Frame:
+    """Result rows of a folder, a file or a single run, as text, without failed runs.
+
+    Raises:
+        UserError: If they are no results.
+    """
+    if path.is_dir() and is_run(path):
+        frame, named = _read_run(path), path.name
+    else:
+        frame, named = read_csv(results_path(path)), path.stem
+    if frame.empty or "success" not in frame or not {"seed", "scenario"} & set(frame.columns):
+        raise UserError(
+            f"{str(path)!r} holds no results of ppl train, sweep, compare, ablation or tune"
+        )
+    for name, value in {"env": "", "algorithm": named, "seed": "0", "step": "0"}.items():
+        if name not in frame:
+            frame[name] = value
+    if "status" in frame:
+        frame = frame[frame["status"] == "done"].copy()
+    for name in ("seed", "step", *(["scenario"] if "scenario" in frame else [])):
+        frame[name] = _numbers(path, frame, name, whole=True)
+    for name in MEASURED:
+        if name in frame:
+            frame[name] = _numbers(path, frame, name)
+    return frame
+
+
+def _numbers(path: Path, frame: Frame, name: str, whole: bool = False) -> Any:
+    """A column as numbers; an empty cell of a measured one is NaN."""
+    import pandas as pd
+
+    found: Any = pd.to_numeric(frame[name], errors="coerce")
+    wrong = found.isna() & ((frame[name] != "") | whole)
+    if whole:
+        wrong |= found % 1 != 0
+    if wrong.any():
+        at = wrong.idxmax()
+        kind = "a whole number" if whole else "a number"
+        told = frame.loc[at, name]
+        raise UserError(f"{str(path)!r}, row {at + 2}: {name} must be {kind}, got {told!r}")
+    return found.astype(int) if whole else found
+
+
+def _plain(value: str) -> str:
+    """Numbers as `ppl sweep` writes them: 4.0 is 4."""
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return value
+
+
+def read_points(path: Path) -> list[Point]:
+    """Everything in results, in their order; runs that failed or diverged are left out.
+
+    Args:
+        path: A run folder; a folder of ppl sweep, compare, ablation or tune; or a file of theirs,
+            with a row per run and evaluation or per scenario. Beside RESULTS.csv a row per scenario
+            is looked for in episodes.csv or RESULTS_episodes.csv.
+
+    Raises:
+        UserError: If there are no results.
+    """
+    frame = read_frame(path)
+    settings = [name for name in frame.columns if name not in _NOT_SETTINGS]
+    for name in settings:
+        frame[name] = frame[name].map(_plain)
+    played = frame if "scenario" in frame else _episodes(path)
     points = []
-    for (env, algorithm, values, step), mine in found.items():
-        mine.sort(key=lambda row: int(row["seed"]))
-        measured = {
-            name: np.array([float(row[name]) for row in mine])
-            for name in MEASURED
-            if all(row.get(name) for row in mine)
-        }
-        seeds = [int(row["seed"]) for row in mine]
-        points.append(Point(env, algorithm, dict(values), step, seeds, measured))
+    for (env, algorithm), mine in frame.groupby(["env", "algorithm"], sort=False):
+        axes = [name for name in settings if mine[name].nunique() > 1]
+        for key, group in mine.groupby([*axes, "step"], sort=False):
+            *values, step = key
+            points.append(
+                _point(
+                    env=str(env),
+                    algorithm=str(algorithm),
+                    values=dict(zip(axes, values, strict=True)),
+                    step=int(step),
+                    group=group,
+                    played=group if "scenario" in frame else played,
+                )
+            )
     return points
 
 
-def _axes(rows: Iterable[Mapping[str, str]]) -> dict[tuple[str, str], list[str]]:
-    """By world and method, the settings that take more than one value."""
-    seen: dict[tuple[str, str], dict[str, set[str]]] = {}
-    for row in rows:
-        mine = seen.setdefault((row.get("env", ""), row["algorithm"]), {})
-        for name, value in row.items():
-            if name not in _NOT_SETTINGS:
-                mine.setdefault(name, set()).add(value)
-    return {
-        where: [name for name, values in columns.items() if len(values) > 1]
-        for where, columns in seen.items()
-    }
+def _point(
+    *,
+    env: str,
+    algorithm: str,
+    values: dict[str, str],
+    step: int,
+    group: Frame,
+    played: Frame | None,
+) -> Point:
+    """The runs of a group, and their episodes where all of them have the same scenarios."""
+    whole = [name for name in MEASURED if name in group and not group[name].isna().any()]
+    by_seed = group.groupby("seed")[whole].mean()
+    seeds = [int(seed) for seed in by_seed.index]
+    measured = {name: by_seed[name].to_numpy(float) for name in whole}
+    point = Point(env, algorithm, values, step, seeds, measured)
+    if played is None:
+        return point
+    mine = played[played["step"] == step]
+    if "run" in mine and "run" in group:
+        mine = mine[mine["run"].isin(group["run"])]
+    else:
+        mine = mine[(mine["algorithm"] == algorithm) & mine["seed"].isin(seeds)]
+    if mine.empty or mine.duplicated(["seed", "scenario"]).any():
+        return point
+    table = mine.pivot(index="seed", columns="scenario", values=[n for n in SCORES if n in mine])
+    if len(table) == len(seeds) and not table.isna().any().any():
+        names = table.columns.get_level_values(0).unique()
+        point.episodes = {str(name): table[name].to_numpy(float) for name in names}
+        point.scenarios = [int(number) for number in table[names[0]].columns]
+    return point
+
+
+def _episodes(path: Path) -> Frame | None:
+    """The rows per scenario that belong to a results file, if they are there."""
+    results = results_path(path)
+    names = [results.with_name(f"{results.stem}_episodes.csv")]
+    if results.name == RESULTS:
+        names.append(results.with_name(EPISODES))
+    for name in names:
+        if name.is_file():
+            return read_frame(name)
+    return None
 
 
 def at_step(points: Sequence[Point], step: int | None) -> list[Point]:
@@ -141,132 +353,36 @@ def at_step(points: Sequence[Point], step: int | None) -> list[Point]:
     return list(last.values())
 
 
-def show(interval: Interval, digits: int) -> str:
-    """`mean [low, high]`."""
-    return f"{interval.mean:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
+def reference_point(points: Sequence[Point], env: str, against: str | None = None) -> Point:
+    """The row that others are compared with.
 
-
-HEADER = [
-    "method",
-    "seeds",
-    "human data",
-    "total data",
-    "success",
-    "IQM",
-    "return",
-    "completion",
-    "cost",
-]
-
-
-def table_rows(points: Sequence[Point]) -> list[list[str]]:
-    """A line per point, under `HEADER`."""
-    lines = []
-    for point in points:
-        human = point.measured["human_data_usage"].mean()
-        scores = point.measured["success"][None]
-        lines.append(
-            [
-                point.label,
-                str(len(point.seeds)),
-                f"{human:.0f} ({human / max(point.step, 1):.2f})",
-                str(point.step),
-                show(point.interval("success"), 2),
-                show(interquartile_interval(scores, np.random.default_rng(0)), 2),
-                show(point.interval("episodic_return"), 0),
-                show(point.interval("progress"), 2),
-                show(point.interval("episodic_cost"), 2),
-            ]
-        )
-    return lines
-
-
-def comparison_rows(points: Sequence[Point], baseline: Point) -> list[list[str]]:
-    """Each other point against one: paired difference of success, and who is likely better."""
-    lines = []
-    for point in points:
-        if point is baseline:
-            continue
-        both = sorted(set(point.seeds) & set(baseline.seeds))
-        ours, theirs = (
-            np.array([p.measured["success"][p.seeds.index(seed)] for seed in both])
-            for p in (point, baseline)
-        )
-        paired = "-"
-        if both:
-            gap = paired_difference(ours[:, None], theirs[:, None], np.random.default_rng(0))
-            paired = show(gap, 2)
-        chance = probability_of_improvement(
-            point.measured["success"][None],
-            baseline.measured["success"][None],
-            np.random.default_rng(0),
-        )
-        lines.append([f"{point.label} against {baseline.label}", paired, show(chance, 2)])
-    return lines
-
-
-def table(command: Table) -> None:
-    """Print a table of results.
+    Args:
+        points: Of one world, at the steps that are compared.
+        env: Its name; "" where the file names none.
+        against: Label of the row (default: the method's default settings where the grid holds
+            them, else the first row).
 
     Raises:
-        UserError: If the file, the step or the row is not there.
+        UserError: If there is no such row.
     """
-    points = at_step(read_points(command.results), command.step)
-    for env in dict.fromkeys(point.env for point in points):
-        mine = [point for point in points if point.env == env]
-        header, rows = list(HEADER), table_rows(mine)
-        name = env or command.env
-        if command.paper:
-            reported = {**paper.METHODS.get(name or "driving", {}), **paper.ABLATION}
-            header.append("paper: human/total, success, return, completion")
-            for point, row in zip(mine, rows, strict=True):
-                row.append(_reported(reported.get(point.algorithm)))
-        if name:
-            print(f"\n{name}\n")
-        write_table(header, rows, command.format)
-        baseline = mine[0]
-        if command.against is not None:
-            named = [point for point in mine if point.label == command.against]
-            if not named:
-                labels = ", ".join(repr(point.label) for point in mine)
-                raise UserError(f"against must be one of {labels}, got {command.against!r}")
-            baseline = named[0]
-        if len(mine) > 1 and min(len(point.seeds) for point in mine) > 1:
-            print()
-            compared = ["success", "paired difference", "P(improvement)"]
-            write_table(compared, comparison_rows(mine, baseline), command.format)
-    print(
-        "\nMeans over seeds with 95% bootstrap intervals; IQM is the interquartile mean; held-out "
-        "scenarios, each once, without the expert."
-    )
-    if command.paper:
-        print("The paper's figures are from another simulator and another expert.")
+    if against is not None:
+        known("against", against, [point.label for point in points])
+        return next(point for point in points if point.label == against)
+    for algorithm in dict.fromkeys(point.algorithm for point in points):
+        mine = [point for point in points if point.algorithm == algorithm]
+        if not mine[0].values:
+            continue
+        defaults = _defaults(algorithm, env or "driving")
+        for point in mine:
+            if all(defaults.get(name) == value for name, value in point.values.items()):
+                return point
+    return points[0]
 
 
-def _reported(row: paper.Reported | None) -> str:
-    if row is None:
-        return "-"
-    data = f"{row.human_data or '-'}/{row.total_data or '-'}"
-    rest = (row.success, row.episodic_return, row.route_completion)
-    return ", ".join([data, *(value or "-" for value in rest)])
-
-
-def write_table(header: Sequence[str], rows: Sequence[Sequence[str]], kind: str) -> None:
-    """Print as "text", "markdown" or "latex" (with booktabs)."""
-    if kind == "text":
-        print_table(header, rows)
-    elif kind == "markdown":
-        for line in (header, ["---"] * len(header), *rows):
-            print("| " + " | ".join(line) + " |")
-    else:
-        print(r"\begin{tabular}{l" + "r" * (len(header) - 1) + "}\n" + r"\toprule")
-        print(" & ".join(_latex(cell) for cell in header) + r" \\" + "\n" + r"\midrule")
-        for row in rows:
-            print(" & ".join(_latex(cell) for cell in row) + r" \\")
-        print(r"\bottomrule" + "\n" + r"\end{tabular}")
-
-
-def _latex(cell: Any) -> str:
-    for sign in ("_", "%", "&", "#"):
-        cell = cell.replace(sign, "\\" + sign)
-    return cell.replace("±", r"$\pm$")
+def _defaults(algorithm: str, env: str) -> dict[str, str]:
+    """A method's default settings in a world, as text; empty where either is unknown here."""
+    try:
+        found = default_settings(algorithm, env)
+    except ValueError:
+        return {}
+    return {k: _plain(str(v)) for k, v in setting_values(*found).items()}

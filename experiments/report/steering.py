@@ -13,7 +13,7 @@ import numpy as np
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import arrays_of, make_world, policy_path, read_policy, run_options
 from experiments.engine.policy_file import load_meta
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from ppl_jax import experts
 
 EVERY = 5  # steps between arrows
@@ -33,14 +33,7 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
     Raises:
         UserError: If a path has no driving policy or there is no such scenario.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    from matplotlib.patches import Polygon
-
-    from envs.driving.rendering import Scene
-
+    need("matplotlib", "plot", "a figure").use("Agg")
     worlds = [run_options(path) for path in paths]
     for path, (name, _) in zip(paths, worlds, strict=True):
         if name != "driving":
@@ -50,13 +43,20 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")
     at = numbers.index(number)
-    played = [episode(env, path, at) for path in paths]
+    _draw(env, at, [episode(env, path, at) for path in paths], number, out=out)
+
+
+def _draw(env: Any, at: int, played: Sequence[dict[str, Any]], number: int, *, out: Path) -> None:
+    """A column per policy: the road with its path above, steering over distance below."""
+    from matplotlib import pyplot
+
+    from envs.driving.rendering import Scene
+
     scene = Scene(tree_index(env.held_out_params.scenarios, jnp.int32(at)))
-    objects = scene.scenario.objects
     picture, panels = pyplot.subplots(
         2,
-        len(paths),
-        figsize=(5.4 * len(paths), 7.2),
+        len(played),
+        figsize=(5.4 * len(played), 7.2),
         height_ratios=(3, 1.4),
         squeeze=False,
         sharey="row",
@@ -64,32 +64,10 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
     )
     reach = np.concatenate([run["position"] for run in played])
     low, high = reach.min(0) - 15, reach.max(0) + 15
-    for i, run in enumerate(played):
-        road, line = panels[0][i], panels[1][i]
-        for surface in scene.surfaces:
-            road.add_patch(Polygon(surface, color=ROAD, linewidth=0))
-        road.plot(objects.box_pose[:, 0], objects.box_pose[:, 1], "s", color=OBJECT, markersize=5)
-        road.plot(objects.circle[:, 0], objects.circle[:, 1], "^", color=OBJECT, markersize=3)
-        position, angle = run["position"], run["heading"] + np.radians(STEEPEST) * run["steer"]
-        road.plot(*position.T, "-", color="black", linewidth=0.6)
-        drawn = road.quiver(
-            *position[::EVERY].T,
-            ARROW * np.cos(angle[::EVERY]),
-            ARROW * np.sin(angle[::EVERY]),
-            3.6 * run["speed"][::EVERY],
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            cmap="viridis",
-            clim=(0, 80),
-            width=0.005,
-        )
+    drawn: Any = None
+    for (road, line), run in zip(panels.T, played, strict=True):
+        drawn = _draw_road(road, scene, run)
         road.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        road.set_xticks([])
-        road.set_yticks([])
-        jerk = np.abs(np.diff(run["steer"])).mean()
-        title = f"{run['label']}: {run['end']}\nmean |change of steering| per step {jerk:.3f}"
-        road.set_title(title, fontsize=10)
         line.plot(run["travelled"], run["steer"], color="black", linewidth=0.9)
         line.set(xlabel="distance driven (m)", ylim=(-1.05, 1.05))
         line.grid(alpha=0.25)
@@ -103,6 +81,36 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
     picture.supxlabel(caption, fontsize=8, x=0.02, ha="left")
     picture.savefig(out, dpi=130)
     pyplot.close(picture)
+
+
+def _draw_road(road: Any, scene: Any, run: dict[str, Any]) -> Any:
+    """The road, its obstacles and one episode; returns the arrows, for the colour bar."""
+    from matplotlib.patches import Polygon
+
+    objects = scene.scenario.objects
+    for surface in scene.surfaces:
+        road.add_patch(Polygon(surface, color=ROAD, linewidth=0))
+    road.plot(objects.box_pose[:, 0], objects.box_pose[:, 1], "s", color=OBJECT, markersize=5)
+    road.plot(objects.circle[:, 0], objects.circle[:, 1], "^", color=OBJECT, markersize=3)
+    position, angle = run["position"], run["heading"] + np.radians(STEEPEST) * run["steer"]
+    road.plot(*position.T, "-", color="black", linewidth=0.6)
+    road.set_xticks([])
+    road.set_yticks([])
+    jerk = np.abs(np.diff(run["steer"])).mean()
+    title = f"{run['label']}: {run['end']}\nmean |change of steering| per step {jerk:.3f}"
+    road.set_title(title, fontsize=10)
+    return road.quiver(
+        *position[::EVERY].T,
+        ARROW * np.cos(angle[::EVERY]),
+        ARROW * np.sin(angle[::EVERY]),
+        3.6 * run["speed"][::EVERY],
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        cmap="viridis",
+        clim=(0, 80),
+        width=0.005,
+    )
 
 
 def episode(env: Any, path: Path, at: int) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def _reference(command: Ablation) -> Path:
     """Clone `reference_steps` expert steps, once; the policy file."""
     steps = str(command.reference_steps)
     words = ("--algorithm", "bc", "--demonstrations", steps, "--total-steps", steps)
-    run_rows(dataclasses.replace(command, seeds=1), [Row("reference", "reference", words)])
+    run_rows(dataclasses.replace(command, seeds=(0,)), [Row("reference", "reference", words)])
     for name in (RESULTS, EPISODES):
         (command.out / name).unlink()
     return command.out / "reference-0" / "policy.npz"

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 from experiments.engine.progress import Progress
 from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import RunSettings, traced_values
 from experiments.report.tables import EPISODES, RESULTS, write_rows
+from ppl_jax.cards import card
 
 if TYPE_CHECKING:
     from experiments.cli import Ablation, Compare, Tune
@@ -59,7 +61,7 @@ def compare(command: Compare) -> None:
     rows = []
     for name in names:
         try:
-            changes = algorithms.method(name).changes(command.env)
+            changes = algorithms.method(name).changes(card(command.env))
         except ValueError as error:
             raise UserError(str(error)) from error
         words = ["--algorithm", name]
@@ -88,7 +90,7 @@ def run_rows(command: Settings, rows: Sequence[Row]) -> None:
     """
     check_counts(command)
     _same_settings(command)
-    jobs = [(row, seed) for seed in range(command.seeds) for row in rows]
+    jobs = [(row, seed) for seed in command.seeds for row in rows]
     waiting = [job for job in jobs if not (_run(command, *job) / SUMMARY).is_file()]
     running: dict[tuple[Row, int], subprocess.Popen] = {}
     cores = _cores(command.processes)
@@ -129,9 +131,8 @@ def check_counts(command: Settings) -> None:
     Raises:
         UserError: One line naming field, value and what is allowed.
     """
-    for name in ("seeds", "processes"):
-        if getattr(command, name) < 1:
-            raise UserError(f"{name} must be at least 1, got {getattr(command, name)}")
+    if command.processes < 1:
+        raise UserError(f"processes must be at least 1, got {command.processes}")
 
 
 def _same_settings(command: Settings) -> None:
@@ -201,13 +202,16 @@ def _collect(command: Settings, rows: Sequence[Row]) -> None:
     """Write results.csv (a row per run and evaluation) and episodes.csv (of each run's last)."""
     points, episodes = [], []
     for row in rows:
-        for seed in range(command.seeds):
+        for seed in command.seeds:
             run = RunFolder(_run(command, row, seed))
             if not (run.path / SUMMARY).is_file():
                 continue
             summary, config = run.read_json(SUMMARY), run.config()
             named = {"algorithm": row.label, "seed": seed, "total_steps": summary["total_steps"]}
-            settings = {name: f"{value:g}" for name, value in config["hparams"].items()}
+            settings = {
+                name: f"{value:g}"
+                for name, value in traced_values(RunSettings.from_json(config)).items()
+            }
             with open(run.path / EVALUATION, newline="") as file:
                 played = list(csv.DictReader(file))
             for step in sorted({int(line["step"]) for line in played}):

@@ -7,9 +7,9 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from experiments.engine.run import RunSettings
 from experiments.engine.runtime import UserError
-from ppl_jax.config import HParams
+from experiments.engine.settings import RunSettings
+from ppl_jax.config import HParams, catalogue, replace, values
 
 Values = Mapping[str, Sequence[Any]]
 
@@ -68,6 +68,17 @@ STUDIES = {
 }
 
 
+def register_study(name: str, study: Study) -> None:
+    """Make a study known by name, to `ppl sweep --study NAME`.
+
+    Raises:
+        ValueError: If the name is taken.
+    """
+    if name in STUDIES:
+        raise ValueError(f"study {name!r} is registered already")
+    STUDIES[name] = study
+
+
 @dataclasses.dataclass(frozen=True)
 class Run:
     """One run of a sweep.
@@ -98,10 +109,10 @@ class Group:
 
 def points(axes: Values) -> list[dict[str, Any]]:
     """Every combination of the axes' values, the last axis fastest."""
-    for name, values in axes.items():
-        if len(set(values)) != len(values):
-            raise UserError(f"{name}: every value once, got {', '.join(map(str, values))}")
-    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    for name, listed in axes.items():
+        if len(set(listed)) != len(listed):
+            raise UserError(f"{name}: every value once, got {', '.join(map(str, listed))}")
+    return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
 
 def run_name(env: str, algorithm: str, values: Mapping[str, Any], seed: int) -> str:
@@ -121,8 +132,10 @@ def plain(value: Any) -> str:
 
 def group_key(settings: RunSettings) -> tuple:
     """Equal for runs that share a program."""
-    traced = {"seed": 0, "hparams": HParams()}
-    return tuple(str(x) for x in dataclasses.astuple(dataclasses.replace(settings, **traced)))
+    static = dataclasses.replace(settings, seed=0, hparams=HParams())
+    owners = settings.hparams.gate, settings.hparams.predictor
+    parts = [getattr(static, field.name) for field in dataclasses.fields(static)]
+    return tuple(str(part) for part in (*parts, *map(type, owners)))
 
 
 def groups(runs: Sequence[Run]) -> list[Group]:
@@ -138,25 +151,31 @@ def groups(runs: Sequence[Run]) -> list[Group]:
 
 
 def widen(runs: Sequence[Run]) -> list[Run]:
-    """Runs with one bound on L per world, method and H, so that another L compiles nothing."""
+    """Runs with one bound on L per environment, method and H, so that another L compiles nothing.
 
-    def where(run: Run) -> tuple:
-        config = dataclasses.replace(run.settings.config, max_preference_horizon=1)
-        return group_key(dataclasses.replace(run.settings, config=config))
-
+    A run of a method without such a bound stays as it is.
+    """
+    bound = "max_preference_horizon"
     most: dict[tuple, int] = {}
     for run in runs:
-        bound = run.settings.config.max_preference_horizon
-        most[where(run)] = max(most.get(where(run), 1), bound)
-    return [
-        dataclasses.replace(
-            run,
-            settings=dataclasses.replace(
-                run.settings,
-                config=dataclasses.replace(
-                    run.settings.config, max_preference_horizon=most[where(run)]
-                ),
-            ),
-        )
-        for run in runs
-    ]
+        mine = values(run.settings.config, run.settings.hparams)
+        if bound in mine:
+            most[_where(run)] = max(most.get(_where(run), 1), mine[bound])
+    widened = []
+    for run in runs:
+        settings = run.settings
+        if _where(run) in most:
+            config, hparams = replace(
+                settings.config, settings.hparams, **{bound: most[_where(run)]}
+            )
+            settings = dataclasses.replace(settings, config=config, hparams=hparams)
+        widened.append(dataclasses.replace(run, settings=settings))
+    return widened
+
+
+def _where(run: Run) -> tuple:
+    """Equal for runs whose static settings differ at most in the bound on L."""
+    mine = catalogue(run.settings.config, run.settings.hparams).values()
+    static = (str((one.name, one.value)) for one in mine if not one.traced)
+    kept = [text for text in static if "max_preference_horizon" not in text]
+    return (run.settings.env, run.settings.algorithm, *kept)

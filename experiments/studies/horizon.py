@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 
 from experiments.engine.progress import Progress
-from experiments.engine.run import algorithm_factory, check, make_env_and_expert
+from experiments.engine.run import algorithm_factory, make_env_and_expert
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import check
 from experiments.report.tables import write_rows
 from ppl_jax import experts
 from ppl_jax.experts import SavedPolicy
@@ -28,12 +29,11 @@ def measure_horizon(command: Horizon) -> None:
     Raises:
         UserError: If a setting cannot work.
     """
-    from experiments.cli import Train, run_settings
+    from experiments.engine.settings import run_settings
 
-    if command.seeds < 1:
-        raise UserError(f"seeds must be at least 1, got {command.seeds}")
-    given = {"total_steps": command.total_steps, "batch_size": command.batch_size}
-    settings = run_settings(Train(command.env, expert=command.expert, **given))
+    asked = {"total_steps": command.total_steps, "batch_size": command.batch_size}
+    given = {name: value for name, value in asked.items() if value is not None}
+    settings = run_settings(command.env, expert=command.expert, given=given)
     config = settings.config
     interval = config.decision_interval
     every = command.measure_every
@@ -61,9 +61,9 @@ def measure_horizon(command: Horizon) -> None:
         return profile(key, lambda observation: experts.act(policy, observation), learner.hparams)
 
     rows, stops = [], config.total_steps // every
-    with Progress(command.seeds * stops, f"measure {command.env}") as progress:
+    with Progress(len(command.seeds) * stops, f"measure {command.env}") as progress:
         progress.start()
-        for seed in range(command.seeds):
+        for number, seed in enumerate(command.seeds):
             learner = jax.jit(functions.init)(jax.random.key(seed), settings.hparams)
             for stop in range(1, stops + 1):
                 learner = chunk(learner)
@@ -71,7 +71,7 @@ def measure_horizon(command: Horizon) -> None:
                 rows += _rows(command.env, seed, stop * every, found)
                 write_rows(command.out, rows)
                 note = f"seed {seed} step {stop * every}: {rows[-1]['interventions']} takeovers"
-                progress.update(seed * stops + stop, note)
+                progress.update(number * stops + stop, note)
 
 
 def _rows(env: str, seed: int, step: int, found: Any) -> list[dict[str, Any]]:

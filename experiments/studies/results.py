@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
+import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.files import write_text_atomic
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import traced_values
 from experiments.report.tables import EPISODES, RESULTS
 from experiments.studies.grid import Run, plain, show
+from ppl_jax.config import values
 from ppl_jax.sweep import evaluation_steps
 
 DONE, DIVERGED, FAILED = "done", "diverged", "failed"
@@ -43,7 +46,7 @@ class Results:
         self.kept: dict[str, tuple[list[dict[str, str]], list[dict[str, str]]]] = {}
         self.episodes: dict[str, list[dict[str, str]]] = {}
         axes = dict.fromkeys(name for run in runs for name, _ in run.values)
-        traced = [field.name for field in dataclasses.fields(runs[0].settings.hparams)]
+        traced = list(dict.fromkeys(name for run in runs for name in traced_values(run.settings)))
         own = [name for name in axes if name not in traced and name not in _STATIC]
         where = ["run", "env", "algorithm", "seed"]
         self.columns = [*where, "status", "step", *COUNTS, *SCORES, *_STATIC, *own, *traced]
@@ -104,8 +107,9 @@ class Results:
 
     def _row(self, run: Run, row: dict[str, Any]) -> dict[str, str]:
         settings = run.settings
-        hparams = {k: f"{v:g}" for k, v in dataclasses.asdict(settings.hparams).items()}
-        static = {name: getattr(settings.config, name) for name in _STATIC}
+        hparams = {k: f"{v:g}" for k, v in traced_values(run.settings).items()}
+        mine = values(settings.config, settings.hparams)
+        static = {name: mine.get(name, "") for name in _STATIC}
         whole = self._where(run) | static | hparams | dict(run.values) | row
         return {name: plain(whole.get(name, "")) for name in self.columns}
 
@@ -140,13 +144,11 @@ class Results:
         ):
             rows = [row for run in self.runs for row in found.get(run.name, [])]
             rows += [row for kept in self.kept.values() for row in kept[at]]
-            path = self.out / name
-            temporary = path.with_suffix(".tmp")
-            with open(temporary, "w", newline="") as file:
-                writer = csv.DictWriter(file, columns, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-            os.replace(temporary, path)
+            text = io.StringIO()
+            writer = csv.DictWriter(text, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+            write_text_atomic(self.out / name, text.getvalue())
 
 
 def _read(path: Path, columns: Sequence[str]) -> dict[str, list[dict[str, str]]]:

@@ -4,27 +4,63 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from envs.registry import known, unknown
 from experiments.engine import schedulers as engines
+from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
-from experiments.engine.run import RunSettings, check
 from experiments.engine.runtime import UserError, revision, versions
+from experiments.engine.settings import (
+    RunSettings,
+    check,
+    default_interval,
+    flat,
+    run_settings,
+    traced_values,
+)
 from experiments.engine.worker import Job, Reply
-from experiments.studies.grid import STUDIES, Group, Run, group_key, groups, points, run_name, widen
+from experiments.studies.grid import (
+    STUDIES,
+    Group,
+    Run,
+    Study,
+    group_key,
+    groups,
+    points,
+    run_name,
+    widen,
+)
 from experiments.studies.results import Results
+from ppl_jax import algorithms
+from ppl_jax.cards import card
+from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
     from experiments.cli import Sweep
 
 SETTINGS = "sweep.json"
 LOG = "workers.log"
-COST = {"driving": 5.0, "table_wiping": 5.0, "nut_assembly": 10.0}  # ms a step, one core, batch 256
 COMPILE_S = 25.0  # of a program that was never compiled before
+
+
+def _study(command: Sweep) -> Study | None:
+    """The study that a command names.
+
+    Raises:
+        UserError: If there is none of that name.
+    """
+    if command.study is None:
+        return None
+    if command.study not in STUDIES:
+        raise UserError(
+            f"study must be one of {', '.join(STUDIES)}, got {command.study!r}"
+            + did_you_mean(command.study, STUDIES)
+        )
+    return STUDIES[command.study]
 
 
 def plan(command: Sweep) -> list[Run]:
@@ -33,38 +69,72 @@ def plan(command: Sweep) -> list[Run]:
     Raises:
         UserError: If a setting cannot work, before anything is built.
     """
-    study = STUDIES[command.study] if command.study else None
-    algorithms = command.algorithms or (study.algorithms if study else ("ppl",))
     runs = []
     for env in command.envs:
-        for algorithm in algorithms:
-            for values in points(_axes(command, env)):
-                for seed in range(command.seeds):
-                    settings = _settings(command, env, algorithm, values, seed)
+        if not known(env):
+            raise UserError(unknown(env))
+        for algorithm in _algorithms(command):
+            for chosen in _points(command, env, algorithm):
+                for seed in command.seeds:
+                    settings = _settings(command, env, algorithm, chosen, seed)
                     if settings is not None:
-                        name = run_name(env, algorithm, values, seed)
-                        runs.append(Run(name, tuple(values.items()), settings))
+                        name = run_name(env, algorithm, chosen, seed)
+                        runs.append(Run(name, tuple(chosen.items()), settings))
     return widen(runs)
 
 
 def _axes(command: Sweep, env: str) -> dict[str, tuple[Any, ...]]:
-    given = {name: values for name, values in vars(command.axes).items() if values}
-    study = dict(STUDIES[command.study].axes) if command.study else {}
+    given = dict(command.axes)
+    study = dict(found.axes) if (found := _study(command)) else {}
     if env != "driving" and command.study == "predictor" and "predictor" not in given:
         raise UserError(f"study predictor is for driving, which alone has two, got {env}")
     return study | given
 
 
+def _points(command: Sweep, env: str, algorithm: str) -> list[dict[str, Any]]:
+    """Every combination of the axes that a method has, each once.
+
+    Raises:
+        UserError: If no method of the sweep has an axis.
+    """
+    known = _known(command, env, algorithm)
+    everyone = set().union(*(_known(command, env, name) for name in _algorithms(command)))
+    axes = _axes(command, env)
+    for name in axes:
+        if name not in everyone:
+            raise UserError(f"unknown setting {name!r}{did_you_mean(name, everyone)}")
+    mine = {name: values for name, values in axes.items() if name in known}
+    return points(mine)
+
+
+def _algorithms(command: Sweep) -> tuple[str, ...]:
+    study = _study(command)
+    return command.algorithms or (study.algorithms if study else ("ppl",))
+
+
+def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
+    """The settings that runs of a method have, under any of the gates and predictors swept over."""
+    found: set[str] = set()
+    axes = {k: v for k, v in _axes(command, env).items() if k in ("gate", "predictor")}
+    for given in points(axes):
+        try:
+            found |= set(values(*algorithms.settings(algorithm, env, command.preset, **given)))
+        except ValueError as error:
+            raise UserError(str(error)) from error
+    return found
+
+
 def _settings(
-    command: Sweep, env: str, algorithm: str, values: dict[str, Any], seed: int
+    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], seed: int
 ) -> RunSettings | None:
     """Of one run; None where a study's L exceeds what the world predicts."""
-    from experiments.cli import Train, default_interval, run_settings
-
+    given = dict(chosen)
+    if command.total_steps is not None:
+        given["total_steps"] = command.total_steps
     common = {name: getattr(command, name) for name in _COMMON}
-    settings = run_settings(Train(env, algorithm, seed, **common, **values))
+    settings = run_settings(env, algorithm, seed, **common, given=given)
     config = settings.config
-    study = STUDIES[command.study] if command.study else None
+    study = _study(command)
     if study and command.total_steps is None and study.length != 1:
         config = dataclasses.replace(config, total_steps=int(config.total_steps * study.length))
     every = command.evaluate_every
@@ -74,14 +144,15 @@ def _settings(
             left, interval = config.total_steps - config.demonstrations, config.decision_interval
             every = max(left // study.evaluations // interval, 1) * interval
     settings = dataclasses.replace(settings, config=config, evaluate_every=every)
-    given = vars(command.axes)["preference_horizon"]
-    if study and not given and settings.hparams.preference_horizon > config.prediction_horizon:
+    horizon = flat(config, settings.hparams).get("preference_horizon", 0)
+    asked = "preference_horizon" in command.axes
+    if study and not asked and horizon > config.prediction_horizon:
         return None
     check(settings)
     return settings
 
 
-_COMMON = ("preset", "total_steps", "expert", "scenarios", "held_out_scenarios")
+_COMMON = ("preset", "expert", "scenarios", "held_out_scenarios")
 
 
 def sweep(command: Sweep) -> None:
@@ -90,7 +161,7 @@ def sweep(command: Sweep) -> None:
     Raises:
         UserError: If a setting is wrong, or a run failed (the others go on).
     """
-    for name, least in (("seeds", 1), ("processes", 1), ("batch", 1)):
+    for name, least in (("processes", 1), ("batch", 1)):
         value = getattr(command, name)
         if value is not None and value < least:
             raise UserError(f"{name} must be at least {least}, got {value}")
@@ -157,9 +228,7 @@ def _open(out: Path, content: dict[str, Any]) -> None:
         raise UserError(f"{str(out)!r} holds something else: give another --out")
     out.mkdir(parents=True, exist_ok=True)
     about = {"versions": versions(), "revision": revision()}
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(about | content, indent=1) + "\n")
-    os.replace(temporary, path)
+    write_text_atomic(path, json.dumps(about | content, indent=1) + "\n")
 
 
 def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:
@@ -172,7 +241,8 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> i
     steps = sum(run.settings.config.total_steps for run in waiting)
     workers = _workers(command)
     seconds = sum(
-        COST.get(run.settings.env, 5.0)
+        card(run.settings.env).step_ms
+        * algorithms.method(run.settings.algorithm).cost
         * run.settings.config.total_steps
         * run.settings.config.batch_size
         / 256e3
@@ -241,7 +311,7 @@ def _jobs(
                     {
                         "index": index[run.name],
                         "seed": run.settings.seed,
-                        "hparams": run.settings.as_json()["hparams"],
+                        "hparams": traced_values(run.settings),
                     }
                     for run in filled
                 ],

@@ -16,32 +16,16 @@ import numpy as np
 from experiments.engine.runtime import UserError
 from experiments.report.tables import RESULTS, print_table, write_rows
 from experiments.studies.compare import Row, budget, run_rows
+from ppl_jax import algorithms
 
 if TYPE_CHECKING:
     from experiments.cli import Tune
 
-_LIKELIHOOD = ("likelihood", ("gaussian", "laplace"))
-_FAST, _SLOW = ("learning_rate", (3e-4, 1e-3)), ("learning_rate", (1e-4, 3e-4))
-
-GRID: dict[str, tuple[tuple[str, tuple], ...]] = {
-    "ppl": (_FAST, _LIKELIHOOD),
-    "bc": (_FAST, _LIKELIHOOD),
-    "gail": (("discriminator_rate", (1e-4, 3e-4)), ("survival_correction", (0.0, 1.0))),
-    "hg_dagger": (_FAST, _LIKELIHOOD),
-    "ensemble_dagger": (_FAST, ("max_discrepancy", (0.02, 0.1))),
-    "thrifty_dagger": (_FAST, ("switch_rate", (0.05, 0.2))),
-    "iwr": (_FAST, _LIKELIHOOD),
-    "eil": (_SLOW, ("margin", (0.1, 1.0))),
-    "haco": (_SLOW, ("conservative_weight", (1.0, 10.0))),
-    "pvp": (_SLOW, ("discount", (0.9, 0.99))),
-}
-
 
 def points(name: str) -> list[dict[str, float | str]]:
     """The settings that are tried for a method."""
-    names = [field for field, _ in GRID[name]]
-    values = itertools.product(*[choices for _, choices in GRID[name]])
-    return [dict(zip(names, chosen, strict=True)) for chosen in values]
+    grid = algorithms.method(name).grid
+    return [dict(zip(grid, chosen, strict=True)) for chosen in itertools.product(*grid.values())]
 
 
 def tune(command: Tune) -> None:
@@ -53,11 +37,12 @@ def tune(command: Tune) -> None:
     Raises:
         UserError: If a method has no grid, or a run failed (the others go on).
     """
-    names = command.algorithms or tuple(GRID)
+    tuned = [name for name in algorithms.registered() if algorithms.method(name).grid]
+    names = command.algorithms or tuple(tuned)
     rows, found = [], {}
     for name in names:
-        if name not in GRID:
-            raise UserError(f"no grid for {name!r}: choose among {', '.join(GRID)}")
+        if name not in tuned:
+            raise UserError(f"no grid for {name!r}: choose among {', '.join(tuned)}")
         for i, point in enumerate(points(name)):
             words = ["--algorithm", name, "--evaluate-on", "training"]
             for field, value in point.items():
@@ -72,7 +57,7 @@ def tune(command: Tune) -> None:
         {
             "algorithm": name,
             "setting": ", ".join(f"{field} {value}" for field, value in point.items()),
-            "seeds": command.seeds,
+            "seeds": len(command.seeds),
             "success": round(float(np.mean(scores[label])), 4),
             "lowest": round(float(np.min(scores[label])), 4),
             "highest": round(float(np.max(scores[label])), 4),

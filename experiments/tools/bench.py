@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make
-from envs.driving.env import make_driving
+from envs.driving.make import make_driving
 from envs.manipulation.scenes.model import SUBSTEPS
+from envs.registry import make
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
 from ppl_jax import algorithms
@@ -150,7 +150,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
 
     def approach(state: Any) -> Any:
         def step(state: Any, _: None) -> Any:
-            action = env.scripted_expert(key, state, env.observe(state, params), params)
+            action = env.experts["scripted"](key, state, env.observe(state, params), params)
             return env.transition(key, state, action, params)[0], action
 
         return jax.lax.scan(step, state, None, length=CONTACT_STEPS)
@@ -171,7 +171,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
     )
     figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
     try:
-        from envs.manipulation.physics.mujoco_c import make_twin
+        from envs.manipulation.twins import make_twin
 
         twin = make_twin(env)
     except ImportError:
@@ -209,7 +209,7 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
     make, seeds = algorithms.method(name).make, 5
 
     def program(make: Any, lanes: int) -> tuple[float, float]:
-        functions = make_train(env, env.scripted_expert, make, config)
+        functions = make_train(env, env.experts["scripted"], make, config)
         steps = max(functions.algorithm.update_every, STEPS)
         blocks = steps // config.decision_interval
         phase = "fit" if name == "bc" else "interact"
@@ -302,7 +302,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     blocks = STEPS // config.decision_interval
 
     def timed(make: Any) -> float:
-        functions = make_train(env, env.scripted_expert, make, config)
+        functions = make_train(env, env.experts["scripted"], make, config)
         program = jax.jit(lambda learner: functions.run_chunk(learner, blocks), donate_argnums=0)
         # a learner with data in its buffers
         learner, _ = program(jax.jit(functions.init)(jax.random.key(0), hparams))
@@ -322,7 +322,7 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
     whole = timed(make_ppl)
     no_gradient = timed(without(update=_no_update))
     no_pairs = timed(
-        without(update=_no_update, store=lambda state, step, hparams: state, uses_predictions=False)
+        without(update=_no_update, store=lambda state, step, hparams: state, predicted_steps=0)
     )
     return {
         "train_ms_per_step": whole,

@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.engine.run import RunSettings, build_world, check, open_folder
+from experiments.engine.run import build_world, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
+from experiments.engine.settings import RunSettings, check, one_level
 from experiments.ui.config import Question, SessionConfig
 from experiments.ui.views import display_of, make_view
 
@@ -128,7 +129,7 @@ def resumed(out: Path, given: Mapping[str, Any]) -> tuple[RunSettings, SessionCo
             "ppl train --resume"
         )
     session_config = SessionConfig.from_json(content, display_of(settings.env).control_rate)
-    held = _flat(settings.as_json()) | vars(session_config)
+    held = _held(settings.as_json()) | vars(session_config)
     wrong = [
         f"{name} is {_short(held.get(name))}, asked for {_short(value)}"
         for name, value in given.items()
@@ -144,11 +145,9 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
+def _held(content: Mapping[str, Any]) -> dict[str, Any]:
     """A run's config.json as one level of names; L is "auto" where it adapts."""
-    flat: dict[str, Any] = {}
-    for name, value in content.items():
-        flat |= value if isinstance(value, dict) else {name: value}
+    flat = one_level(content)
     if flat.get("adaptive_horizon"):
         flat["preference_horizon"] = "auto"
     return flat

@@ -22,8 +22,9 @@ import numpy as np
 from experiments.engine.evaluate import evaluate_policy, read_evaluation, summarise_episodes
 from experiments.engine.policy_file import save_policy
 from experiments.engine.recording import PredictedPath, Recorder
-from experiments.engine.run import RunSettings, algorithm_factory, restore_learner, saved_policy
+from experiments.engine.run import algorithm_factory, restore_learner, saved_policy
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
+from experiments.engine.settings import RunSettings
 from ppl_jax import checkpoint
 from ppl_jax.interaction import Learner, summarise
 from ppl_jax.live import make_live

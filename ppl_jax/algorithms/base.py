@@ -28,31 +28,35 @@ class Algorithm(NamedTuple):
         act: `act(state, key, observation [O]) -> action [A]`, what the novice does while training.
             It is clipped to [-1, 1] before it is executed.
         decide: `decide(state, point, hparams) -> bool`, whether the expert takes over for the next
-            block of steps.
+            block of steps; None leaves it to the gate that the configuration names.
         store: `store(state, interaction, hparams) -> state`.
         update: `update(state, key, hparams) -> (state, metrics)`.
         policy: `policy(state) -> Layers`: the deterministic policy that is evaluated, saved and
             exported (ReLU between layers, tanh at the end, input centred and scaled).
-        uses_predictions: Whether `store` reads `interaction.predicted`.
-        needs_expert_rollout: Whether `decide` reads the expert's own prediction.
+        predicted_steps: Steps of `interaction.predicted` that `store` reads; 0 where it reads none.
+        labels_predictions: The expert is asked at these predicted states, too.
+        needs_expert_rollout: Its own `decide` reads `point.experts`.
         update_every: Steps between updates: 1, or a multiple of `decision_interval`.
-        supports_human: Whether an expert decides when to take over; not so where the method's own rule does,
-            or nobody.
         fit: Update of the phase between demonstrations and the first step; `update` where None.
     """
 
     name: str
     init: Callable[[jax.Array], PyTree]
     act: Callable[[PyTree, jax.Array, jax.Array], jax.Array]
-    decide: Callable[[PyTree, DecisionPoint, HParams], jax.Array]
     store: Callable[[PyTree, Interaction, HParams], PyTree]
     update: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]]
     policy: Callable[[PyTree], Layers]
-    uses_predictions: bool = False
+    decide: Callable[[PyTree, DecisionPoint, HParams], jax.Array] | None = None
+    predicted_steps: int = 0
+    labels_predictions: bool = False
     needs_expert_rollout: bool = False
     update_every: int = 1
-    supports_human: bool = True
     fit: Callable[[PyTree, jax.Array, HParams], tuple[PyTree, Metrics]] | None = None
+
+    @property
+    def supports_human(self) -> bool:
+        """Whether an expert, a person too, decides when to take over."""
+        return self.decide is None
 
 
 MakeAlgorithm = Callable[[EnvSpec, TrainConfig], Algorithm]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -13,10 +14,18 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.gates import Gate, never
+from ppl_jax.fields import setting
+from ppl_jax.gates import never
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Layers, layers, make_policy
 from ppl_jax.types import EnvSpec, Interaction
+
+
+@flax.struct.dataclass
+class ClonerHParams:
+    """Traced settings of methods that only clone."""
+
+    bc_weight: jax.Array | float = setting(1.0, "Weight of the behaviour-cloning loss.", low=0)
 
 
 @flax.struct.dataclass
@@ -37,7 +46,9 @@ def make_bc(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     return make_cloner("bc", spec, config, never)
 
 
-def make_cloner(name: str, spec: EnvSpec, config: TrainConfig, decide: Gate) -> Algorithm:
+def make_cloner(
+    name: str, spec: EnvSpec, config: TrainConfig, decide: Callable[..., jax.Array] | None
+) -> Algorithm:
     """A policy that clones every step under the expert's control, whoever gave it control.
 
     L = -E_{D_h}[ log pi(a_h|s) ]
@@ -63,7 +74,7 @@ def make_cloner(name: str, spec: EnvSpec, config: TrainConfig, decide: Gate) -> 
         observation, action = cloned
         mean = policy.apply(params, observation)
         bc, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction)
-        return hparams.bc_weight * bc, metrics
+        return hparams.method.bc_weight * bc, metrics
 
     def update(state: ClonerState, key: jax.Array, hparams: HParams) -> tuple[ClonerState, Metrics]:
         cloned = buffers.sample(state.human_buffer, key, config.batch_size)
@@ -75,7 +86,12 @@ def make_cloner(name: str, spec: EnvSpec, config: TrainConfig, decide: Gate) -> 
     def policy_layers(state: ClonerState) -> Layers:
         return layers(state.learned.average)
 
-    supports_human = decide is not never
     return Algorithm(
-        name, init, act, decide, store, update, policy_layers, supports_human=supports_human
+        name=name,
+        init=init,
+        act=act,
+        decide=decide,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

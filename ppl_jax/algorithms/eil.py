@@ -14,13 +14,25 @@ from ppl_jax.algorithms.base import ActorCritic, Algorithm, adam_step, init_lear
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
-from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy
 from ppl_jax.types import EnvSpec, Interaction
 
 OTHERS = 3  # uniform random actions that the expert's is held against
 POLICY_DELAY = 2
+
+
+@flax.struct.dataclass
+class EILHParams:
+    """Traced settings of EIL."""
+
+    bc_weight: jax.Array | float = setting(
+        0.0, "Weight of the behaviour-cloning loss; the publication has none.", low=0, common=True
+    )
+    margin: jax.Array | float = setting(
+        0.1, "Hinge margins of the action values.", low=0, common=True
+    )
 
 
 @flax.struct.dataclass
@@ -203,7 +215,7 @@ def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         action = policy.apply(params, observation)
         value = critic.apply(critics, observation, action)[0]
         cloned = jnp.mean(log_likelihood(action[:half], expert_action, config.likelihood))
-        return -jnp.mean(weight * value) - hparams.bc_weight * cloned
+        return -jnp.mean(weight * value) - hparams.method.bc_weight * cloned
 
     def update(state: EILState, key: jax.Array, hparams: HParams) -> tuple[EILState, Metrics]:
         key_human, key_robot, key_others = jax.random.split(key, 3)
@@ -215,7 +227,7 @@ def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         others = jnp.concatenate([human[2][None], random])
 
         def loss(params: Any) -> tuple[jax.Array, Metrics]:
-            return critic_loss(params, human, judged, weight, others, hparams.margin)
+            return critic_loss(params, human, judged, weight, others, hparams.method.margin)
 
         actor, critics = state.learned.actor, state.learned.critic
         grads, metrics = jax.grad(loss, has_aux=True)(critics.params)
@@ -235,15 +247,11 @@ def make_eil(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: EILState) -> Layers:
         return layers(state.learned.actor.average)
 
-    gate = make_gate(config.gate, spec.observation_scale)
-    needs_expert_rollout = config.gate in COMPARING
     return Algorithm(
-        "eil",
-        init,
-        act,
-        gate,
-        store,
-        update,
-        policy_layers,
-        needs_expert_rollout=needs_expert_rollout,
+        name="eil",
+        init=init,
+        act=act,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

@@ -13,9 +13,35 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Ensemble, Layers, ensemble_layers, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
+
+
+@dataclasses.dataclass(frozen=True)
+class EnsembleConfig:
+    """Static settings of methods with an ensemble of policies."""
+
+    members: int = setting(5, "Policies of the ensemble.", low=1, common=True)
+
+
+@flax.struct.dataclass
+class EnsembleDAggerHParams:
+    """Traced settings of Ensemble-DAgger."""
+
+    max_ensemble_variance: jax.Array | float = setting(
+        0.01,
+        "Variance of the members' actions above which the expert acts.",
+        low=0,
+        common=True,
+    )
+    max_discrepancy: jax.Array | float = setting(
+        0.05,
+        "Squared distance between the novice's and the expert's action above which it acts.",
+        low=0,
+        common=True,
+    )
 
 
 @flax.struct.dataclass
@@ -49,7 +75,7 @@ def init_bootstrap(key: jax.Array, spec: EnvSpec, config: TrainConfig) -> Bootst
     """Empty data sets; which row goes to which member how often is drawn beforehand."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     rows = min(config.human_capacity, config.total_steps)
-    copies = jax.random.poisson(key, 1.0, (rows, config.members)).astype(jnp.float32)
+    copies = jax.random.poisson(key, 1.0, (rows, config.method.members)).astype(jnp.float32)
     return Bootstrap(buffers.init_buffer(item, rows), copies)
 
 
@@ -72,7 +98,7 @@ def clone_members(
     A member's batch is half a `batch_size`, near the published 100.
     """
     count = buffers.size(human.buffer)
-    shape = (config.members, max(config.batch_size // 2, 1))
+    shape = (config.method.members, max(config.batch_size // 2, 1))
     rows = jax.random.randint(key, shape, 0, jnp.maximum(count, 1))
     observation, action = jax.tree.map(lambda leaf: leaf[rows], human.buffer.data)  # [K, B, ...]
     weight = jnp.take_along_axis(human.copies.T, rows, axis=1)
@@ -81,7 +107,7 @@ def clone_members(
     def loss(params: Any) -> tuple[jax.Array, Metrics]:
         mean = ensemble.each(params, observation)
         each, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction, weight)
-        return config.members * each, metrics  # a member's gradient is what it were alone
+        return config.method.members * each, metrics  # a member's gradient is what it were alone
 
     grads, metrics = jax.grad(loss, has_aux=True)(learned.params)
     return adam_step(learned, grads, hparams.learning_rate, count > 0), metrics
@@ -100,7 +126,7 @@ def make_ensemble_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     with a_n the ensemble's action. Only steps under the expert's control are learnt from, the
     demonstrations at the start included, and count as human data.
     """
-    ensemble = make_ensemble(spec, config.hidden, config.members)
+    ensemble = make_ensemble(spec, config.hidden, config.method.members)
 
     def init(key: jax.Array) -> EnsembleState:
         key_params, key_data = jax.random.split(key)
@@ -114,10 +140,10 @@ def make_ensemble_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     def decide(state: EnsembleState, point: DecisionPoint, hparams: HParams) -> jax.Array:
         unsure = (
             ensemble_variance(ensemble, state.learned.params, point.observation)
-            > hparams.max_ensemble_variance
+            > hparams.method.max_ensemble_variance
         )
         apart = jnp.sum((point.novice_action - point.expert_action) ** 2)
-        return unsure | (apart > hparams.max_discrepancy)
+        return unsure | (apart > hparams.method.max_discrepancy)
 
     def store(state: EnsembleState, step: Interaction, hparams: HParams) -> EnsembleState:
         del hparams
@@ -133,5 +159,11 @@ def make_ensemble_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         return ensemble_layers(state.learned.average)
 
     return Algorithm(
-        "ensemble_dagger", init, act, decide, store, update, policy_layers, supports_human=False
+        name="ensemble_dagger",
+        init=init,
+        act=act,
+        decide=decide,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

@@ -14,6 +14,7 @@ from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
+from ppl_jax.fields import setting
 from ppl_jax.gates import never
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy, make_raw
@@ -24,6 +25,30 @@ GAE_LAMBDA = 0.95
 EPOCHS = 5
 DISCRIMINATOR_UPDATES = 8  # per rollout
 INITIAL_LOG_STD = -0.7
+
+
+@dataclasses.dataclass(frozen=True)
+class GAILConfig:
+    """Static settings of GAIL."""
+
+    rollout_steps: int = setting(2000, "Steps between updates.", low=1, common=True)
+
+
+@flax.struct.dataclass
+class GAILHParams:
+    """Traced settings of GAIL."""
+
+    discount: jax.Array | float = setting(0.99, "gamma.", low=0, high=1, common=True)
+    discriminator_rate: jax.Array | float = setting(
+        3e-4, "Adam's learning rate of the discriminator.", low=0, common=True
+    )
+    survival_correction: jax.Array | float = setting(
+        1.0,
+        "1 for the reward log D - log(1 - D), 0 for -log(1 - D).",
+        low=0,
+        high=1,
+        common=True,
+    )
 
 
 @flax.struct.dataclass
@@ -89,7 +114,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     """
     policy, value = make_policy(spec, config.hidden), make_raw(spec, config.hidden, 1)
     discriminator = make_critic(spec, config.hidden, 1)
-    size, batches = config.batch_size, max(config.rollout_steps // config.batch_size, 1)
+    size, batches = config.batch_size, max(config.method.rollout_steps // config.batch_size, 1)
 
     def init(key: jax.Array) -> GAILState:
         key_policy, key_value, key_disc = jax.random.split(key, 3)
@@ -107,7 +132,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
             ),
             human_buffer=buffers.init_buffer((observation, action), max(config.demonstrations, 1)),
             rollout=buffers.init_buffer(
-                OnPolicyStep(observation, action, observation, no, no), config.rollout_steps
+                OnPolicyStep(observation, action, observation, no, no), config.method.rollout_steps
             ),
         )
 
@@ -155,7 +180,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
                 )
 
             value, grads = jax.value_and_grad(loss)(learned.params)
-            return adam_step(learned, grads, hparams.discriminator_rate), value
+            return adam_step(learned, grads, hparams.method.discriminator_rate), value
 
         keys = jax.random.split(key, DISCRIMINATOR_UPDATES)
         learned, losses = jax.lax.scan(step, learned, keys)
@@ -168,7 +193,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         before = value.apply(learned.value.params, steps.observation)[..., 0]
         after = value.apply(learned.value.params, steps.next_observation)[..., 0]
         advantage = advantages(
-            reward, before, after, steps.terminated, steps.done, hparams.discount, GAE_LAMBDA
+            reward, before, after, steps.terminated, steps.done, hparams.method.discount, GAE_LAMBDA
         )
         returns = advantage + before
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -197,7 +222,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
             return learned, loss
 
         def epoch(learned: GAILLearned, key: jax.Array) -> tuple[GAILLearned, jax.Array]:
-            order = jax.random.permutation(key, config.rollout_steps)
+            order = jax.random.permutation(key, config.method.rollout_steps)
             rows = order[: batches * size].reshape(batches, -1)
             return jax.lax.scan(minibatch, learned, rows)
 
@@ -209,7 +234,7 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         steps: OnPolicyStep = state.rollout.data  # full and in order: it is as long as a round
         disc, loss = discriminate(state, state.learned.discriminator, key_disc, hparams)
         novice_logit = logit(disc.params, steps.observation, steps.action)
-        reward = imitation_reward(novice_logit, hparams.survival_correction)
+        reward = imitation_reward(novice_logit, hparams.method.survival_correction)
         learned = dataclasses.replace(state.learned, discriminator=disc)
         learned, value_loss = improve(learned, steps, reward, key_policy, hparams)
         return dataclasses.replace(state, learned=learned), {
@@ -235,14 +260,13 @@ def make_gail(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         return layers(state.learned.policy.average["mean"])
 
     return Algorithm(
-        "gail",
-        init,
-        act,
-        never,
-        store,
-        update,
-        policy_layers,
-        update_every=config.rollout_steps,
-        supports_human=False,
+        name="gail",
+        init=init,
+        act=act,
+        decide=never,
+        store=store,
+        update=update,
+        policy=policy_layers,
+        update_every=config.method.rollout_steps,
         fit=fit,
     )

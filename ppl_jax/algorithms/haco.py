@@ -16,10 +16,24 @@ from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import squashed_gaussian
-from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_raw
 from ppl_jax.types import EnvSpec, Interaction
+
+
+@flax.struct.dataclass
+class HACOHParams:
+    """Traced settings of HACO."""
+
+    discount: jax.Array | float = setting(0.99, "gamma.", low=0, high=1, common=True)
+    polyak_tau: jax.Array | float = setting(0.005, "tau of the target networks.", low=0, high=1)
+    conservative_weight: jax.Array | float = setting(
+        10.0,
+        "c: weight of raising the expert's action values over the novice's.",
+        low=0,
+        common=True,
+    )
 
 
 @flax.struct.dataclass
@@ -137,7 +151,7 @@ def _make(name: str, spec: EnvSpec, config: TrainConfig, ported: bool) -> Algori
         executed = critic.apply(params, batch.observation, batch.executed_action)
         novices = critic.apply(params, batch.observation, batch.novice_action)
         return proxy_loss(
-            executed, novices, target, batch.takeover, weight, hparams.conservative_weight
+            executed, novices, target, batch.takeover, weight, hparams.method.conservative_weight
         )
 
     def cost_loss(
@@ -177,18 +191,18 @@ def _make(name: str, spec: EnvSpec, config: TrainConfig, ported: bool) -> Algori
         loss_value, grads = jax.value_and_grad(value_loss)(
             learned.value.params,
             batch,
-            td_target(values, batch.terminated, hparams.discount, entropy=-alpha * log_pi),
+            td_target(values, batch.terminated, hparams.method.discount, entropy=-alpha * log_pi),
             weight,
             hparams,
         )
-        value = step(learned.value, grads, polyak_tau=hparams.polyak_tau)
+        value = step(learned.value, grads, polyak_tau=hparams.method.polyak_tau)
         loss_cost, grads = jax.value_and_grad(cost_loss)(
             learned.cost.params,
             batch,
-            td_target(costs, batch.terminated, hparams.discount, paid=price),
+            td_target(costs, batch.terminated, hparams.method.discount, paid=price),
             weight,
         )
-        cost = step(learned.cost, grads, polyak_tau=hparams.polyak_tau)
+        cost = step(learned.cost, grads, polyak_tau=hparams.method.polyak_tau)
         learned = dataclasses.replace(learned, value=value, cost=cost)
         (loss_actor, mean_log_pi), grads = jax.value_and_grad(actor_loss, has_aux=True)(
             learned.actor.params, learned, key_actor, batch.observation, weight
@@ -204,15 +218,11 @@ def _make(name: str, spec: EnvSpec, config: TrainConfig, ported: bool) -> Algori
         *before, (w, b) = layers(state.learned.actor.average)
         return [*before, (w[:, :actions], b[:actions])]  # the mean alone
 
-    gate = make_gate(config.gate, spec.observation_scale)
-    needs_expert_rollout = config.gate in COMPARING
     return Algorithm(
-        name,
-        init,
-        act,
-        gate,
-        store,
-        update,
-        policy_layers,
-        needs_expert_rollout=needs_expert_rollout,
+        name=name,
+        init=init,
+        act=act,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

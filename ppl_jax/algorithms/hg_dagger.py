@@ -5,7 +5,6 @@ from __future__ import annotations
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.bc import make_cloner
 from ppl_jax.config import TrainConfig
-from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.types import EnvSpec
 
 
@@ -16,7 +15,4 @@ def make_hg_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     retrained after every episode, as all methods here are; this is PPL without its preference
     loss.
     """
-    gate = make_gate(config.gate, spec.observation_scale)
-    return make_cloner("hg_dagger", spec, config, gate)._replace(
-        needs_expert_rollout=config.gate in COMPARING
-    )
+    return make_cloner("hg_dagger", spec, config, decide=None)

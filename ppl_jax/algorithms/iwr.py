@@ -13,7 +13,6 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.gates import COMPARING, make_gate
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Layers, layers, make_policy
 from ppl_jax.types import EnvSpec, Interaction
@@ -73,15 +72,11 @@ def make_iwr(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: IWRState) -> Layers:
         return layers(state.learned.average)
 
-    gate = make_gate(config.gate, spec.observation_scale)
-    needs_expert_rollout = config.gate in COMPARING
     return Algorithm(
-        "iwr",
-        init,
-        act,
-        gate,
-        store,
-        update,
-        policy_layers,
-        needs_expert_rollout=needs_expert_rollout,
+        name="iwr",
+        init=init,
+        act=act,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

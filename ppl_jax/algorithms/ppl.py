@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.fields import setting
 from ppl_jax.losses import (
     NEEDS_REFERENCE,
     Metrics,
@@ -28,6 +29,114 @@ from ppl_jax.types import EnvSpec, Interaction, PreferenceBatch
 
 Reference = Callable[[jax.Array], jax.Array]
 """A frozen policy, `reference(observation [B, O]) -> action [B, A]`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PPLConfig:
+    """Static settings of PPL."""
+
+    max_preference_horizon: int = setting(10, "Largest L a run may use; L itself is traced.", low=1)
+    adaptive_horizon: bool = setting(
+        False, "Choose L while training, from the expert's answers at predicted states."
+    )
+    preference_capacity: int = setting(
+        50_000, "Rows of the buffer of preference pairs; the oldest go first.", low=1
+    )
+    pair_states: Literal["predicted", "shifted"] = setting(
+        "predicted",
+        "Pairs at predicted states 1..L, or one state apart as in the released code.",
+        choices=("predicted", "shifted"),
+    )
+    objective: Literal["cpo", "dpo", "ipo", "slic_hf", "imitation"] = setting(
+        "cpo",
+        "Loss on preference pairs.",
+        choices=("cpo", "dpo", "ipo", "slic_hf", "imitation"),
+        common=True,
+    )
+    objective_target: Literal["pair", "library"] = setting(
+        "pair",
+        "Margin of ipo and slic_hf: one that bounded actions can reach, or the libraries' constant.",
+        choices=("pair", "library"),
+    )
+    preferred: Literal["expert", "random"] = setting(
+        "expert", "Preferred actions of the pairs.", choices=("expert", "random")
+    )
+    rejected: Literal["novice", "random"] = setting(
+        "novice", "Rejected actions of the pairs.", choices=("novice", "random")
+    )
+
+    def check(self, config: TrainConfig, hparams: HParams) -> None:
+        """Check L against the horizons.
+
+        Raises:
+            ValueError: One line naming field, value and what is allowed.
+        """
+        horizon = np.asarray(hparams.method.preference_horizon)
+        shown = horizon.tolist()
+        for name, most in (
+            ("prediction_horizon", config.prediction_horizon),
+            ("max_preference_horizon", self.max_preference_horizon),
+        ):
+            if (horizon > most).any():
+                raise ValueError(f"preference_horizon must not exceed {name} ({most}), got {shown}")
+
+
+@flax.struct.dataclass
+class PPLHParams:
+    """Traced settings of PPL."""
+
+    preference_horizon: jax.Array | float = setting(
+        4,
+        "L: predicted states that get a preference pair; auto chooses it while training.",
+        low=1,
+        choices=("auto",),
+        common=True,
+    )
+    beta: jax.Array | float = setting(
+        0.1, "Temperature of the preference loss.", low=0, common=True
+    )
+    bc_weight: jax.Array | float = setting(
+        1.0, "Weight of the behaviour-cloning loss.", low=0, common=True
+    )
+    preference_weight: jax.Array | float = setting(
+        1.0, "Weight of the preference loss; 0 leaves cloning alone.", low=0, common=True
+    )
+    preference_bias: jax.Array | float = setting(
+        0.5,
+        "Factor on the rejected action's likelihood: 1 in the paper, 0.5 in the released code.",
+        low=0,
+        common=True,
+    )
+
+
+MOST_PAIRS = 10  # that preference_horizon "auto" may choose
+
+
+def fit_horizons(
+    config: TrainConfig, hparams: HParams, given: Mapping[str, Any]
+) -> tuple[TrainConfig, HParams]:
+    """Fit `max_preference_horizon` to L and H, and turn L = "auto" into `adaptive_horizon`.
+
+    Args:
+        config: Static settings.
+        hparams: Traced settings.
+        given: The settings that somebody asked for, by name.
+    """
+    method, horizon = config.method, hparams.method.preference_horizon
+    if horizon == "auto":
+        horizon = max(1, min(MOST_PAIRS, config.prediction_horizon))
+        method = dataclasses.replace(method, adaptive_horizon=True)
+        hparams = dataclasses.replace(
+            hparams, method=dataclasses.replace(hparams.method, preference_horizon=horizon)
+        )
+    most = method.max_preference_horizon
+    if "prediction_horizon" in given and "max_preference_horizon" not in given:
+        most = max(1, min(most, config.prediction_horizon))
+    longest = float(np.max(horizon))
+    if longest <= config.prediction_horizon and "max_preference_horizon" not in given:
+        most = max(most, int(longest))
+    method = dataclasses.replace(method, max_preference_horizon=most)
+    return dataclasses.replace(config, method=method), hparams
 
 
 @flax.struct.dataclass
@@ -64,17 +173,17 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
     Raises:
         ValueError: If the objective needs a reference and none is given.
     """
-    if config.objective in NEEDS_REFERENCE and reference is None:
-        raise ValueError(f"objective {config.objective!r} needs a reference policy")
+    if config.method.objective in NEEDS_REFERENCE and reference is None:
+        raise ValueError(f"objective {config.method.objective!r} needs a reference policy")
     policy = make_policy(spec, config.hidden)
-    shifted = config.pair_states == "shifted"
-    random = "random" in (config.preferred, config.rejected)
-    adaptive = config.adaptive_horizon
+    shifted = config.method.pair_states == "shifted"
+    random = "random" in (config.method.preferred, config.method.rejected)
+    adaptive = config.method.adaptive_horizon
 
     def init(key: jax.Array) -> PPLState:
         observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
         pair = PreferenceBatch(observation, action, action, observation if shifted else None)
-        rows, actions = config.preference_capacity, None
+        rows, actions = config.method.preference_capacity, None
         if random:
             shape = (2, rows, spec.action_size)
             actions = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0, maxval=1.0)
@@ -85,7 +194,9 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
             ),
             preference_buffer=buffers.init_buffer(pair, rows),
             random_actions=actions,
-            horizon=horizon.init_horizon(config.max_preference_horizon) if adaptive else None,
+            horizon=horizon.init_horizon(config.method.max_preference_horizon)
+            if adaptive
+            else None,
         )
 
     def act(state: PPLState, key: jax.Array, observation: jax.Array) -> jax.Array:
@@ -111,8 +222,8 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
     def pairs_per_step(state: PPLState, hparams: HParams) -> jax.Array | float:
         """L."""
         if state.horizon is None:
-            return hparams.preference_horizon
-        return horizon.choose(state.horizon, hparams.preference_horizon)
+            return hparams.method.preference_horizon
+        return horizon.choose(state.horizon, hparams.method.preference_horizon)
 
     def store(state: PPLState, step: Interaction, hparams: HParams) -> PPLState:
         human = buffers.add(
@@ -121,14 +232,16 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
             step.takeover[None],
         )
         state = watch(state, step)
-        pairs, mask = preference_pairs(step, pairs_per_step(state, hparams), config.pair_states)
+        pairs, mask = preference_pairs(
+            step, pairs_per_step(state, hparams), config.method.pair_states
+        )
         if state.random_actions is not None:
             rank = jnp.cumsum(mask) - 1
-            rows = (state.preference_buffer.next + rank) % config.preference_capacity
+            rows = (state.preference_buffer.next + rank) % config.method.preference_capacity
             preferred, rejected = state.random_actions[:, rows]
-            if config.preferred == "random":
+            if config.method.preferred == "random":
                 pairs = dataclasses.replace(pairs, preferred_action=preferred)
-            if config.rejected == "random":
+            if config.method.rejected == "random":
                 pairs = dataclasses.replace(pairs, rejected_action=rejected)
         return dataclasses.replace(
             state,
@@ -157,18 +270,21 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
             pairs.preferred_action,
             rejected_mean,
             pairs.rejected_action,
-            hparams.preference_bias,
+            hparams.method.preference_bias,
             config.likelihood,
             means(reference) if reference is not None else None,
         )
         preference, more = preference_loss(
             compared,
-            hparams.beta,
-            hparams.preference_bias,
-            config.objective,
-            config.objective_target,
+            hparams.method.beta,
+            hparams.method.preference_bias,
+            config.method.objective,
+            config.method.objective_target,
         )
-        total = hparams.bc_weight * bc + hparams.preference_weight * has_pairs * preference
+        total = (
+            hparams.method.bc_weight * bc
+            + hparams.method.preference_weight * has_pairs * preference
+        )
         return total, metrics | more
 
     def update(state: PPLState, key: jax.Array, hparams: HParams) -> tuple[PPLState, Metrics]:
@@ -189,13 +305,12 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
         return layers(state.learned.average)
 
     return Algorithm(
-        "ppl",
-        init,
-        act,
-        make_gate(config.gate, spec.observation_scale),
-        store,
-        update,
-        policy_layers,
-        uses_predictions=True,
-        needs_expert_rollout=config.gate in COMPARING,
+        name="ppl",
+        init=init,
+        act=act,
+        store=store,
+        update=update,
+        policy=policy_layers,
+        predicted_steps=config.method.max_preference_horizon,
+        labels_predictions=adaptive,
     )

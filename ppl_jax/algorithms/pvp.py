@@ -15,13 +15,24 @@ from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
-from ppl_jax.gates import COMPARING, make_gate
+from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, layers, make_critic, make_policy
 from ppl_jax.types import EnvSpec, Interaction
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5  # TD3's, on the target policy's action
 POLICY_DELAY = 2  # TD3's: updates of the critic per update of the actor
+
+
+@flax.struct.dataclass
+class PVPHParams:
+    """Traced settings of PVP."""
+
+    bc_weight: jax.Array | float = setting(
+        0.0, "Weight of the cloning term: 0 in PVP, 1 in PVP4Real.", low=0, common=True
+    )
+    discount: jax.Array | float = setting(0.99, "gamma.", low=0, high=1, common=True)
+    polyak_tau: jax.Array | float = setting(0.005, "tau of the target networks.", low=0, high=1)
 
 
 @flax.struct.dataclass
@@ -101,7 +112,7 @@ def make_pvp(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         action = policy.apply(params, batch.observation)
         value = critic.apply(critics, batch.observation, action)[0]
         log_pi = log_likelihood(action, batch.expert_action, config.likelihood)
-        return policy_loss(value, log_pi, batch.takeover, weight, hparams.bc_weight)
+        return policy_loss(value, log_pi, batch.takeover, weight, hparams.method.bc_weight)
 
     def update(state: PVPState, key: jax.Array, hparams: HParams) -> tuple[PVPState, Metrics]:
         key_batch, key_noise = jax.random.split(key)
@@ -114,9 +125,11 @@ def make_pvp(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         values = critic.apply(
             critics.average, batch.next_observation, jnp.clip(following, -1.0, 1.0)
         )
-        target = td_target(values, batch.terminated, hparams.discount)
+        target = td_target(values, batch.terminated, hparams.method.discount)
         grads, metrics = jax.grad(critic_loss, has_aux=True)(critics.params, batch, target, weight)
-        critics = adam_step(critics, grads, hparams.learning_rate, has_data, hparams.polyak_tau)
+        critics = adam_step(
+            critics, grads, hparams.learning_rate, has_data, hparams.method.polyak_tau
+        )
 
         def improve(actor: Any) -> Any:
             grads = jax.grad(actor_loss)(actor.params, critics.params, batch, weight, hparams)
@@ -130,15 +143,11 @@ def make_pvp(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     def policy_layers(state: PVPState) -> Layers:
         return layers(state.learned.actor.average)
 
-    gate = make_gate(config.gate, spec.observation_scale)
-    needs_expert_rollout = config.gate in COMPARING
     return Algorithm(
-        "pvp",
-        init,
-        act,
-        gate,
-        store,
-        update,
-        policy_layers,
-        needs_expert_rollout=needs_expert_rollout,
+        name="pvp",
+        init=init,
+        act=act,
+        store=store,
+        update=update,
+        policy=policy_layers,
     )

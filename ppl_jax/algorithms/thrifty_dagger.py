@@ -20,6 +20,7 @@ from ppl_jax.algorithms.ensemble_dagger import (
 )
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.fields import setting
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, ensemble_layers, make_critic, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
@@ -31,6 +32,20 @@ RECENT = 500  # steps of the novice whose ensemble_variance and safety set the t
 ENOUGH = 25  # of them, before which the initial thresholds hold
 UNSAFE, SAFE = 0.48, 0.495  # initial thresholds of safety: ask, and hand back
 SAMPLE = 256  # demonstrated states whose ensemble_variance sets the initial threshold of novelty
+
+
+@flax.struct.dataclass
+class ThriftyDAggerHParams:
+    """Traced settings of Thrifty-DAgger."""
+
+    switch_rate: jax.Array | float = setting(
+        0.1,
+        "alpha: share of the novice's states that each of the two tests hands to the expert.",
+        low=0,
+        high=1,
+        common=True,
+    )
+    polyak_tau: jax.Array | float = setting(0.005, "tau of the target networks.", low=0, high=1)
 
 
 @flax.struct.dataclass
@@ -106,7 +121,7 @@ def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     Updated at every step, as all methods here are, where the published code retrains from scratch
     after every 2000 steps (and forgets to do so with the target networks).
     """
-    ensemble = make_ensemble(spec, config.hidden, config.members)
+    ensemble = make_ensemble(spec, config.hidden, config.method.members)
     critic = make_critic(spec, config.hidden, 2)
 
     def safety(params: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
@@ -140,11 +155,12 @@ def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         shown = state.human.buffer
         rows = jnp.arange(SAMPLE) % jnp.maximum(buffers.size(shown), 1)
         at_first = jnp.quantile(
-            ensemble_variance(ensemble, policies, shown.data[0][rows]), 1.0 - hparams.switch_rate
+            ensemble_variance(ensemble, policies, shown.data[0][rows]),
+            1.0 - hparams.method.switch_rate,
         )
         few = held < ENOUGH
-        novel = jnp.where(few, at_first, quantile(recent, doubts, 1.0 - hparams.switch_rate))
-        unsafe = jnp.where(few, UNSAFE, quantile(recent, safeties, hparams.switch_rate))
+        novel = jnp.where(few, at_first, quantile(recent, doubts, 1.0 - hparams.method.switch_rate))
+        unsafe = jnp.where(few, UNSAFE, quantile(recent, safeties, hparams.method.switch_rate))
         safe = jnp.where(few, SAFE, quantile(recent, safeties, 0.5))
         now = safety(state.learned.risk.params, point.observation, point.novice_action)
         ask = (ensemble_variance(ensemble, policies, point.observation) > novel) | (now < unsafe)
@@ -205,7 +221,7 @@ def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
             grads,
             hparams.learning_rate,
             buffers.size(state.steps) > 0,
-            hparams.polyak_tau,
+            hparams.method.polyak_tau,
         )
         learned = dataclasses.replace(learned, policies=policies, risk=risk)
         return dataclasses.replace(state, learned=learned), metrics | {"loss_risk": loss}
@@ -225,13 +241,12 @@ def make_thrifty_dagger(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         return ensemble_layers(state.learned.policies.average)
 
     return Algorithm(
-        "thrifty_dagger",
-        init,
-        act,
-        decide,
-        store,
-        update,
-        policy_layers,
+        name="thrifty_dagger",
+        init=init,
+        act=act,
+        decide=decide,
+        store=store,
+        update=update,
+        policy=policy_layers,
         fit=fit,
-        supports_human=False,
     )

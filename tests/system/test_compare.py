@@ -1,11 +1,6 @@
 """Host loop and comparisons, on the probe world: phases, resume, failures, tables."""
 
 import csv
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,29 +9,12 @@ import envs
 from experiments.engine.run import RunSettings, train
 from experiments.report import paper, tables
 from experiments.studies.ablation import LIBRARY, ROWS
-from experiments.studies.tune import GRID, points
+from experiments.studies.tune import points
 from ppl_jax import algorithms, checkpoint
-from tests.helpers import Probe
-from tests.unit.test_algorithms import probe_settings
+from tests.helpers import ROOT, Probe, call, outcome, probe_settings, program
 
-ROOT = Path(__file__).parent.parent.parent
 if "probe" not in envs.registered():
     envs.register("probe", Probe)
-
-PROGRAM = """
-import envs
-from experiments.cli import main
-from ppl_jax.algorithms import register
-from tests.helpers import Probe
-
-def broken(spec, config):
-    raise ValueError("this method is broken")
-
-envs.register("probe", Probe)
-register("broken", broken)
-if __name__ == "__main__":
-    main()
-"""
 
 
 def run_settings(name):
@@ -47,19 +25,6 @@ def run_settings(name):
         changes["total_steps"] = 20
     config, hparams = probe_settings(name, **changes)
     return RunSettings("probe", name, 0, config, hparams, evaluate_every=20)
-
-
-def outcome(out):
-    newest = out / "checkpoints" / f"step_{checkpoint.steps(out / 'checkpoints')[-1]}"
-    lines = (out / "metrics.jsonl").read_text().splitlines()
-    return {
-        "learner": json.loads((newest / "checksum.json").read_text())["crc32"],
-        "evaluation": (out / "evaluation.csv").read_text(),
-        "metrics": [
-            {k: v for k, v in json.loads(line).items() if not k.startswith("time/")}
-            for line in lines
-        ],
-    }
 
 
 @pytest.mark.parametrize("name", ["bc", "gail", "thrifty_dagger", "haco"])
@@ -92,24 +57,6 @@ def test_a_run_stopped_in_any_phase_goes_on_bit_for_bit(name, tmp_path, monkeypa
         monkeypatch.setattr(checkpoint, "save", really)
         train(settings, out, resume=True)
         assert outcome(out) == whole
-
-
-def program(tmp_path, *words, code=0):
-    script = tmp_path / "own.py"
-    script.write_text(PROGRAM)
-    return call(script, *words, code=code)
-
-
-def call(script, *words, code=0):
-    done = subprocess.run(
-        [sys.executable, str(script), *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=560,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done
 
 
 SMALL = ["--seeds", "2", "--total-steps", "40", "--evaluate-every", "20", "--batch-size", "8"]
@@ -184,7 +131,11 @@ def test_the_paper_s_figures_stand_beside_ours_and_are_marked(tmp_path, capsys):
 def test_all_methods_have_a_grid_of_the_same_size_and_the_paper_s_row():
     names = algorithms.registered(variants=False)
     assert len(names) == 10
-    assert set(GRID) == set(names) == set(paper.METHODS["driving"])
+    assert (
+        {name for name in algorithms.registered() if algorithms.method(name).grid}
+        == set(names)
+        == set(paper.METHODS["driving"])
+    )
     assert {len(points(name)) for name in names} == {4}
     assert set(ROWS) == set(paper.ABLATION)
     assert len(ROWS) == 10

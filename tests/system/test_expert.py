@@ -17,8 +17,7 @@ from experiments.engine.runtime import UserError
 from experiments.report import card, figures
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.ppo.config import PPOConfig, PPOHParams
-from tests.helpers import Probe
-from tests.system.test_compare import outcome
+from tests.helpers import Probe, outcome
 
 if "probe" not in envs.registered():
     envs.register("probe", Probe)

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 import envs
-from experiments.cli import Axes, Sweep
-from experiments.engine.run import RunSettings, algorithm_factory, make_env_and_expert, train
+from experiments.engine.run import algorithm_factory, make_env_and_expert, train
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import RunSettings, traced_values
 from experiments.engine.worker import Worker
+from experiments.options.commands import Sweep
 from experiments.studies import grid
 from experiments.studies.runner import plan
 from ppl_jax import sweep as pure
+from ppl_jax.config import replace
 from ppl_jax.training import make_train
-from tests.helpers import Probe
-from tests.system.test_compare import ROOT, program
-from tests.unit.test_algorithms import probe_settings
+from tests.helpers import ROOT, Probe, probe_settings, program
 
 if "probe" not in envs.registered():
     envs.register("probe", Probe)
@@ -82,7 +82,7 @@ def test_a_batch_is_its_runs_one_by_one():
     settings = settings_of("ppl")
     env, lane = lane_of(settings)
     hparams = [
-        settings.hparams.replace(preference_horizon=horizon, beta=beta)
+        replace(settings.config, settings.hparams, preference_horizon=horizon, beta=beta)[1]
         for horizon, beta in ((1, 0.1), (4, 0.1), (4, 0.5))
     ]
     keys = jax.vmap(jax.random.key)(np.arange(3, dtype=np.uint32))
@@ -133,10 +133,10 @@ def test_a_batch_is_shared_out_over_devices(tmp_path):
 
 
 def command(*worlds, **changes):
-    names = {field.name for field in dataclasses.fields(Axes)}
-    axes = Axes(**{name: values for name, values in changes.items() if name in names})
-    rest = {name: value for name, value in changes.items() if name not in names}
-    return Sweep(worlds, axes=axes, **rest)
+    names = {field.name for field in dataclasses.fields(Sweep)}
+    axes = {name: values for name, values in changes.items() if name not in names}
+    rest = {name: value for name, value in changes.items() if name in names}
+    return Sweep(worlds, axes=axes, **({"seeds": range(rest.pop("seeds", 5))} | rest))
 
 
 def test_what_is_traced_shares_a_program_and_what_is_static_does_not():
@@ -167,11 +167,9 @@ def test_a_new_value_compiles_nothing():
         (4, 0.1, 0.0, 1e-3, 0),
         (4, 0.5, 0.25, 1e-4, 7),
     ):
-        hparams = base.hparams.replace(
-            preference_horizon=horizon, beta=beta, prediction_noise=noise, learning_rate=rate
-        )
-        run = {"index": 0, "seed": seed}
-        run["hparams"] = dataclasses.replace(base, hparams=hparams).as_json()["hparams"]
+        traced = {"preference_horizon": horizon, "beta": beta}
+        traced |= {"prediction_noise": noise, "learning_rate": rate}
+        run = {"index": 0, "seed": seed, "hparams": traced_values(base) | traced}
         job = {"settings": base.as_json(), "side_by_side": False, "runs": [run]}
         reply = worker.run(json.loads(json.dumps(job)))
         assert "error" not in reply, reply
@@ -191,7 +189,7 @@ def test_studies_are_the_papers():
     assert noises == [0, 0.0625, 0.125, 0.25, 0.5, 1]
     assert {run.settings.algorithm for run in runs} == {"ppl", "pvp"}
     runs = plan(command("table_wiping", study="horizon_beta", beta=(0.1,), seeds=1))
-    assert {run.settings.hparams.beta for run in runs} == {0.1}  # what is given replaces
+    assert {run.settings.hparams.method.beta for run in runs} == {0.1}  # what is given replaces
     assert len(grid.groups(runs)) == 1
 
 

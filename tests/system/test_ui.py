@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
-from experiments.cli import Play
 from experiments.engine import recording
 from experiments.engine.evaluate import read_evaluation
 from experiments.engine.policy_file import load_policy
@@ -23,6 +22,7 @@ from experiments.engine.recorded import length_of, recorded_functions
 from experiments.engine.run import RunSettings, open_folder, train
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
+from experiments.options.commands import Play
 from experiments.ui import views
 from experiments.ui.config import Question, SessionConfig
 from experiments.ui.options import named_options
@@ -43,10 +43,11 @@ from experiments.ui.protocol import (
 from experiments.ui.session import ANSWERS, CONSENT, Session
 from experiments.ui.trainer import LOG, InteractiveTrainer
 from ppl_jax import algorithms, checkpoint
-from ppl_jax.config import HParams, TrainConfig
-from tests.helpers import Probe
+from tests.helpers import Probe, plain_settings
 
-CONFIG = TrainConfig(
+CONFIG, HP = plain_settings(
+    "ppl",
+    learning_rate=3e-3,
     total_steps=300,
     batch_size=16,
     hidden=(16,),
@@ -56,7 +57,7 @@ CONFIG = TrainConfig(
     human_capacity=300,
     preference_capacity=1000,
 )
-SETTINGS = RunSettings("probe", "ppl", 0, CONFIG, HParams(learning_rate=3e-3), expert="person")
+SETTINGS = RunSettings("probe", "ppl", 0, CONFIG, HP, expert="person")
 PROBE = Probe()
 
 

@@ -11,37 +11,18 @@ import pytest
 from ppl_jax import algorithms, buffers, checkpoint
 from ppl_jax.algorithms import eil, gail, haco, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
-from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.config import HParams
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.experts import SavedPolicy, act
 from ppl_jax.networks import ensemble_layers, make_ensemble
 from ppl_jax.training import make_train, phases
-from tests.helpers import Balance, Goal, Probe
+from tests.helpers import OWN, Balance, Goal, Probe, probe_settings
 
 RNG = np.random.default_rng(1)
 B, K, A = 6, 2, 3
 NAMES = algorithms.registered()
-TINY = TrainConfig(
-    total_steps=800,
-    batch_size=32,
-    hidden=(32,),
-    prediction_horizon=6,
-    decision_interval=5,
-    max_preference_horizon=6,
-    human_capacity=2000,
-    preference_capacity=2000,
-    members=3,
-    rollout_steps=100,
-)
 HP = HParams(learning_rate=3e-3)
 PROBES = {"gail": Goal}  # it has to see the expert succeed
-OWN = {
-    "bc": {"total_steps": 200, "demonstrations": 200, "offline_updates": 400},
-    "gail": {"total_steps": 8200, "demonstrations": 200},
-    "iwr": {"demonstrations": 40, "offline_updates": 50},
-    "ensemble_dagger": {"demonstrations": 40, "offline_updates": 100},
-    "thrifty_dagger": {"demonstrations": 40, "offline_updates": 100},
-}
 
 
 def pairwise(a, b):
@@ -54,21 +35,6 @@ def uniform(*shape):
 
 def coins(*shape):
     return RNG.integers(0, 2, shape).astype(bool)
-
-
-def probe_settings(name, **changes):
-    _, own = algorithms.settings(name, "probe")
-    hparams = dataclasses.replace(
-        own,
-        learning_rate=3e-3,
-        discriminator_rate=1e-3,
-        polyak_tau=0.02,
-        survival_correction=1.0,  # success ends the episode in these worlds
-    )
-    static = {k: v for k, v in changes.items() if hasattr(TINY, k)}
-    traced = {k: v for k, v in changes.items() if k not in static}
-    config = dataclasses.replace(TINY, **(OWN.get(name, {}) | static))
-    return config, dataclasses.replace(hparams, **traced)
 
 
 def functions(name, probe=None, **changes):

@@ -6,8 +6,7 @@ import numpy as np
 
 from ppl_jax import horizon
 from ppl_jax.training import make_train
-from tests.helpers import Probe
-from tests.unit.test_algorithms import probe_settings
+from tests.helpers import Probe, probe_settings
 
 RNG = np.random.default_rng(4)
 

@@ -1,4 +1,3 @@
-import dataclasses
 from typing import Any
 
 import jax
@@ -7,26 +6,34 @@ import numpy as np
 import pytest
 
 from ppl_jax import algorithms
-from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.config import values
 from ppl_jax.live import make_live
-from tests.helpers import Probe
+from tests.helpers import Probe, plain_settings
 
-CONFIG = TrainConfig(
-    total_steps=200,
-    batch_size=16,
-    hidden=(16,),
-    prediction_horizon=6,
-    decision_interval=5,
-    max_preference_horizon=6,
-    human_capacity=200,
-    preference_capacity=1000,
-)
-HP = HParams(learning_rate=3e-3)
+SMALL = {
+    "total_steps": 200,
+    "batch_size": 16,
+    "hidden": (16,),
+    "prediction_horizon": 6,
+    "decision_interval": 5,
+    "max_preference_horizon": 6,
+    "human_capacity": 200,
+    "preference_capacity": 1000,
+    "learning_rate": 3e-3,
+}
+
+
+def small(algorithm="ppl", **changes):
+    known = values(*plain_settings(algorithm))
+    return plain_settings(algorithm, **({k: SMALL[k] for k in SMALL if k in known} | changes))
+
+
+CONFIG, HP = small()
 NO_KEY: Any = None  # acting without noise needs none
 
 
 def live(algorithm="ppl", **changes):
-    probe, config = Probe(), dataclasses.replace(CONFIG, **changes)
+    probe, (config, _) = Probe(), small(algorithm, **changes)
     make = algorithms.method(algorithm).make
     fns = make_live(probe, make, config, place=lambda state: state.error[None])
     return probe, fns

@@ -3,7 +3,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax.predictors import add_noise, predict, selected_transition
+from ppl_jax.config import NoHParams
+from ppl_jax.predictors import add_noise, predict
+from ppl_jax.predictors import predictor as named
 
 H = 8
 
@@ -23,7 +25,8 @@ def start(world):
 @pytest.mark.parametrize("predictor", ["simulator", "kinematic"])
 def test_a_prediction_is_the_transition_in_a_loop_and_leaves_no_trace(world, start, predictor):
     params, action = world.default_params, jnp.array([0.3, 0.5])
-    transition = selected_transition(world, predictor)
+    rolled = named(predictor).make(world)
+    transition = lambda *args: rolled(*args, NoHParams())  # noqa: E731
     before = jax.tree.map(np.array, start)
     predicted = jax.jit(
         lambda s: predict(world, transition, jax.random.key(1), s, action, params, H, observe=True)
@@ -81,4 +84,4 @@ def test_an_unknown_predictor_is_named():
     from tests.helpers import Probe
 
     with pytest.raises(ValueError, match="'probe' has no predictor 'kinematic'"):
-        selected_transition(Probe(), "kinematic")
+        named("kinematic").make(Probe())

@@ -3,13 +3,32 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax.config import HParams
-from ppl_jax.gates import deviates_from_expert, low_return, unsafe_or_slow
+from ppl_jax.gates import (
+    DeviatesFromExpertHParams,
+    LowReturnHParams,
+    UnsafeOrSlowHParams,
+    deviates_from_expert,
+    low_return,
+    unsafe_or_slow,
+)
 from ppl_jax.preference import preference_pairs
-from ppl_jax.types import Interaction, Trajectory
+from ppl_jax.types import DecisionPoint, Interaction, Trajectory
 
 M, O, A = 6, 4, 2
 SCALE = np.array([1.0, 1.0, 2.0, 1.0], np.float32)
+
+
+def point(novice, experts=None):
+    """A decision where the rules look at predicted trajectories alone."""
+    return DecisionPoint(
+        observation=jnp.zeros(O),
+        novice_action=jnp.zeros(A),
+        expert_action=jnp.zeros(A),
+        takeover=jnp.zeros((), bool),
+        trajectory=novice,
+        experts=experts,
+        log_density=jnp.asarray(jnp.nan),
+    )
 
 
 def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=()):
@@ -92,7 +111,10 @@ def test_changing_the_horizon_compiles_nothing():
     ],
 )
 def test_the_driving_gate(case, expected):
-    assert bool(unsafe_or_slow(trajectory(**case), None, HParams(min_speed=5.0), SCALE)) is expected
+    assert (
+        bool(unsafe_or_slow(point(trajectory(**case)), UnsafeOrSlowHParams(min_speed=5.0), SCALE))
+        is expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -105,7 +127,10 @@ def test_the_driving_gate(case, expected):
     ],
 )
 def test_the_released_gate(case, expected):
-    assert bool(low_return(trajectory(**case), None, HParams(min_return=10.0), SCALE)) is expected
+    assert (
+        bool(low_return(point(trajectory(**case)), LowReturnHParams(min_return=10.0), SCALE))
+        is expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -121,7 +146,7 @@ def test_the_gate_that_compares_with_the_expert(case, shift, expected):
     novice = trajectory(**case)
     experts = trajectory()
     experts = experts.replace(observation=experts.observation.at[-1].add(jnp.array(shift)))
-    hparams = HParams(max_departure=1.0)
-    assert bool(deviates_from_expert(novice, experts, hparams, SCALE)) is expected
+    hparams = DeviatesFromExpertHParams(max_departure=1.0)
+    assert bool(deviates_from_expert(point(novice, experts), hparams, SCALE)) is expected
     with pytest.raises(ValueError, match="expert's own prediction"):
-        deviates_from_expert(novice, None, hparams, SCALE)
+        deviates_from_expert(point(novice), hparams, SCALE)

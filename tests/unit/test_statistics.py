@@ -54,7 +54,9 @@ def test_interquartile_mean_is_scipys_trimmed_mean():
 
 def test_interval_of_the_interquartile_mean_is_scipys():
     scores = np.random.default_rng(1).normal(size=20)
-    ours = statistics.interquartile_interval(scores[None], np.random.default_rng(0), 0.95, 20_000)
+    ours = statistics.interquartile_interval(
+        scores[None], np.random.default_rng(0), level=0.95, replicates=20_000
+    )
     theirs = scipy.stats.bootstrap(
         (scores,),
         lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis=axis),
@@ -81,3 +83,45 @@ def test_probability_of_improvement_is_mann_whitneys():
     assert found.low < found.mean < found.high
     sure = statistics.probability_of_improvement([[2.0, 3.0]], [[0.0, 1.0]], rng)
     assert (sure.mean, sure.low, sure.high) == (1.0, 1.0, 1.0)
+
+
+def test_one_seed_has_an_interval_over_scenarios_and_one_number_has_none():
+    scores = np.random.default_rng(0).random((1, 50))
+    one = mean_interval(scores)
+    assert one.known
+    assert one.mean == pytest.approx(scores.mean())
+    assert one.low < one.mean < one.high
+    alone = mean_interval([[0.28]])
+    assert alone.mean == 0.28
+    assert not alone.known
+
+
+def test_the_generator_is_the_same_unless_one_is_given():
+    scores = np.random.default_rng(3).random((4, 10))
+    assert mean_interval(scores) == mean_interval(scores, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (
+            lambda: mean_interval(np.ones(5)),
+            r"scores must be \[seeds, scenarios\].*got shape \(5,\)",
+        ),
+        (lambda: mean_interval(np.ones((0, 3))), r"not empty, got shape \(0, 3\)"),
+        (lambda: mean_interval([[1, 2]], level=95), "level must lie between 0 and 1, got 95"),
+        (lambda: mean_interval([[1, 2]], replicates=0), "replicates must be at least 1, got 0"),
+        (
+            lambda: paired_difference(np.ones((4, 1)), np.ones((4, 3))),
+            r"same shape, got \(4, 1\) and \(4, 3\)",
+        ),
+        (lambda: interquartile_mean([]), "scores must not be empty"),
+        (
+            lambda: statistics.probability_of_improvement(np.ones((1, 3)), np.ones((2, 3))),
+            "same tasks, got 1 and 2",
+        ),
+    ],
+)
+def test_scores_of_another_shape_are_refused(call, told):
+    with pytest.raises(ValueError, match=told):
+        call()

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -7,27 +8,39 @@ import pytest
 
 from ppl_jax import algorithms, experts
 from ppl_jax.algorithms.ppl import make_ppl
-from ppl_jax.config import HParams, TrainConfig, reference, validate
+from ppl_jax.config import replace, validate, values
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.training import make_train
-from tests.helpers import Probe
+from tests.helpers import Probe, plain_settings
 
-TINY = TrainConfig(
-    total_steps=600,
-    batch_size=32,
-    hidden=(32,),
-    prediction_horizon=6,
-    decision_interval=5,
-    max_preference_horizon=6,
-    human_capacity=600,
-    preference_capacity=2000,
-)
-HP = HParams(learning_rate=3e-3)
+SMALL = {
+    "total_steps": 600,
+    "batch_size": 32,
+    "hidden": (32,),
+    "prediction_horizon": 6,
+    "decision_interval": 5,
+    "max_preference_horizon": 6,
+    "human_capacity": 600,
+    "preference_capacity": 2000,
+    "learning_rate": 3e-3,
+}
+
+
+def small(algorithm="ppl", **changes):
+    known = values(*plain_settings(algorithm))
+    return plain_settings(algorithm, **({k: SMALL[k] for k in SMALL if k in known} | changes))
+
+
+def set_to(hparams, **changes):
+    return replace(small()[0], hparams, **changes)[1]
+
+
+TINY, HP = small()
 
 
 def functions(dependent=True, algorithm="ppl", **changes):
     probe = Probe(dependent)
-    config = dataclasses.replace(TINY, **changes)
+    config, _ = small(algorithm, **changes)
     return probe, make_train(
         probe, probe.scripted_expert, algorithms.method(algorithm).make, config
     )
@@ -46,7 +59,7 @@ def success(probe, fns, learner):
 @pytest.mark.parametrize("dependent", [False, True])
 def test_probe_worlds_are_solved(algorithm, dependent):
     probe, fns = functions(dependent, algorithm)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), small(algorithm)[1])
     assert success(probe, fns, learner) == 1.0
     for sign in probe.default_params.signs:
         action = fns.algorithm.act(learner.algorithm, None, jnp.array([sign, 0.0, 1.0]))
@@ -63,15 +76,15 @@ def test_a_gate_by_action_probability():
     )
     expert = experts.neural_expert(policy)
     np.testing.assert_allclose(expert(None, None, jnp.array([-1.0, 0.3, 1.0]), None), [-0.6])
-    config = dataclasses.replace(TINY, gate="action_probability")
+    config, hparams = small(gate="action_probability", min_log_density=-1.0)
     fns = make_train(probe, expert, make_ppl, config)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP.replace(min_log_density=-1.0))
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
     assert success(probe, fns, learner) == 1.0
     assert 0 < int(learner.counters.human_data) < 400
     run = jax.jit(lambda learner: fns.run_chunk(learner, 1))
     for wrong, takes_over in ((0.6, False), (0.55, False), (-0.6, True), (0.0, True)):
         # at -1: a distance of 0.44 or more is that unlikely
-        start = fns.init(jax.random.key(1), HP.replace(min_log_density=-1.0, learning_rate=0.0))
+        start = fns.init(jax.random.key(1), set_to(hparams, learning_rate=0.0))
         bias = jnp.arctanh(wrong * start.env_state.sign)
         start = jax.tree.map(jnp.zeros_like, start.algorithm.learned.params), start
         params = {**start[0]}
@@ -89,16 +102,18 @@ def test_a_gate_by_action_probability():
 
 def test_the_released_settings_run_and_solve_the_probe():
     probe = Probe()
-    config, hparams = reference()
-    config = dataclasses.replace(
-        config,
+    config, hparams = algorithms.settings(
+        "ppl",
+        "driving",
+        "reference",
         total_steps=600,
         batch_size=32,
         hidden=(32,),
         predictor="simulator",
+        learning_rate=3e-3,
+        min_return=-3.0,
     )
     fns = make_train(probe, probe.scripted_expert, make_ppl, config)
-    hparams = hparams.replace(learning_rate=3e-3, min_return=-3.0)
     learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
     assert success(probe, fns, learner) == 1.0
 
@@ -122,26 +137,20 @@ def test_without_an_expert_in_reach_nothing_is_learnt():
 def test_a_vmapped_batch_is_the_runs_one_by_one():
     _, fns = functions(total_steps=100)
     seeds = jnp.arange(4)
-    grid = HParams(
-        preference_horizon=jnp.array([1.0, 3.0, 6.0, 4.0]),
-        beta=jnp.array([0.1, 0.3, 1.0, 0.0]),
-        prediction_noise=jnp.array([0.0, 0.1, 0.2, 0.0]),
-        expert_noise=jnp.array([0.0, 0.0, 0.1, 0.2]),
-        learning_rate=jnp.full(4, 1e-3),
-    )
-    axes = HParams(
-        **{f.name: 0 if jnp.ndim(getattr(grid, f.name)) else None for f in dataclasses.fields(grid)}
-    )
+    swept = {
+        "preference_horizon": jnp.array([1.0, 3.0, 6.0, 4.0]),
+        "beta": jnp.array([0.1, 0.3, 1.0, 0.0]),
+        "prediction_noise": jnp.array([0.0, 0.1, 0.2, 0.0]),
+        "expert_noise": jnp.array([0.0, 0.0, 0.1, 0.2]),
+        "learning_rate": jnp.full(4, 1e-3),
+    }
+    grid = set_to(HP, **swept)
+    axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, grid)
     keys = jax.vmap(jax.random.key)(seeds)
     together, metrics = jax.jit(jax.vmap(fns.train, in_axes=(0, axes)))(keys, grid)
     train = jax.jit(fns.train)
     for i in range(4):
-        one = HParams(
-            **{
-                f.name: value[i] if jnp.ndim(value := getattr(grid, f.name)) else value
-                for f in dataclasses.fields(grid)
-            }
-        )
+        one = set_to(HP, **{name: column[i] for name, column in swept.items()})
         alone, alone_metrics = train(keys[i], jax.tree.map(jnp.float32, one))
         assert int(alone.counters.human_data) == int(together.counters.human_data[i])
         for a, b in zip(
@@ -199,7 +208,7 @@ def test_chunks_are_the_whole_run_bit_for_bit():
 def test_buffers_hold_what_algorithm_1_says():
     """Replay the run step by step in Python and compare the data sets."""
     probe, fns = functions(total_steps=100)
-    hparams = HP.replace(preference_horizon=2)
+    hparams = set_to(HP, preference_horizon=2)
     learner = jax.jit(fns.init)(jax.random.key(0), hparams)
     chunk = jax.jit(fns.run_chunk, static_argnums=1)
     learner, _ = chunk(learner, 20)
@@ -234,29 +243,45 @@ def test_a_diverged_run_is_flagged_and_frozen():
 
 
 @pytest.mark.parametrize(
-    ("config", "hparams", "message"),
+    ("algorithm", "changes", "message"),
     [
-        ({"total_steps": 0}, {}, "total_steps must be at least 1, got 0"),
-        ({"total_steps": 7}, {}, "total_steps must be a multiple of decision_interval"),
-        ({"demonstrations": 7}, {}, "demonstrations must be a multiple of decision_interval"),
+        ("ppl", {"total_steps": 0}, "total_steps must be at least 1, got 0"),
+        ("ppl", {"total_steps": 7}, "total_steps must be a multiple of decision_interval"),
+        ("ppl", {"demonstrations": 7}, "demonstrations must be a multiple of decision_interval"),
+        ("ppl", {"demonstrations": 605}, "demonstrations must not exceed total_steps"),
         (
-            {"demonstrations": 605},
-            {},
-            "demonstrations must not exceed total_steps",
+            "ppl",
+            {"offline_updates": 10},
+            "offline_updates needs demonstrations to learn from, got 10",
         ),
-        ({"offline_updates": 10}, {}, "offline_updates needs demonstrations to learn from, got 10"),
-        ({}, {"discount": 1.5}, "discount must lie between 0 and 1, got 1.5"),
-        ({}, {"margin": -1.0}, "margin must not be negative, got -1"),
-        ({"members": 0}, {}, "members must be at least 1, got 0"),
-        ({}, {"preference_horizon": 0}, "preference_horizon must be at least 1, got 0"),
-        ({}, {"preference_horizon": 7}, "preference_horizon must not exceed prediction_horizon"),
-        ({}, {"beta": -0.1}, "beta must not be negative"),
-        ({}, {"beta": float("nan")}, "beta must not be negative, got nan"),
-        ({}, {"prediction_noise": -1.0}, "prediction_noise must not be negative"),
-        ({"hidden": ()}, {}, "hidden must name at least one width"),
+        ("pvp", {"discount": 1.5}, "discount must lie between 0 and 1, got 1.5"),
+        ("eil", {"margin": -1.0}, "margin must not be negative, got -1"),
+        ("ensemble_dagger", {"members": 0}, "members must be at least 1, got 0"),
+        ("ppl", {"preference_horizon": 0}, "preference_horizon must be at least 1, got 0"),
+        ("ppl", {"preference_horizon": 7}, "preference_horizon must not exceed prediction_horizon"),
+        ("ppl", {"beta": -0.1}, "beta must not be negative, got -0.1"),
+        ("ppl", {"beta": float("nan")}, "beta must not be negative, got nan"),
+        ("ppl", {"beta": float("inf")}, "beta must be a finite number, got inf"),
+        ("ppl", {"prediction_noise": -1.0}, "prediction_noise must not be negative"),
+        ("ppl", {"hidden": ()}, "hidden must name at least one width"),
+        ("ppl", {"hidden": (8, 0)}, "hidden must be at least 1, got"),
+        ("ppl", {"likelihood": "student"}, "likelihood must be one of gaussian, laplace, got"),
     ],
 )
-def test_bad_settings_are_one_clear_line(config, hparams, message):
+def test_bad_settings_are_one_clear_line(algorithm, changes, message):
     with pytest.raises(ValueError, match=message) as error:
-        validate(dataclasses.replace(TINY, **config), HP.replace(**hparams))
+        validate(*small(algorithm, **changes))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"beat": 0.1}, "unknown setting 'beat': did you mean 'beta'?"),
+        ({"margin": 0.1}, "unknown setting 'margin'"),
+        ({"gate": "low_retrun"}, "got 'low_retrun': did you mean 'low_return'?"),
+    ],
+)
+def test_unknown_settings_are_refused_with_a_near_name(changes, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        algorithms.settings("ppl", "driving", **changes)

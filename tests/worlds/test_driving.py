@@ -7,7 +7,8 @@ import pytest
 
 from envs.driving import geometry, lidar, vehicle
 from envs.driving import navigation as nav
-from envs.driving.env import contacts, make_driving
+from envs.driving.env import contacts
+from envs.driving.make import make_driving
 from envs.driving.maps import MapSettings, _draw_blocks, generate
 from envs.driving.scenario import Capacity, pack, tree_index
 from ppl_jax.evaluation import evaluate

@@ -8,7 +8,7 @@ import pytest
 
 from envs.driving import fidelity
 from envs.driving.blocks import BLOCK_KINDS, first_block
-from envs.driving.env import make_driving
+from envs.driving.make import make_driving
 from envs.driving.recorded import load_recording, load_recordings, recording_paths
 from envs.driving.roads import DECORATION
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envs.manipulation.control import operational_space
+from envs.manipulation.make import make_nut_assembly, make_table_wiping
 from envs.manipulation.physics.analytic import arm, grasp_contact, wipe_contact
 from envs.manipulation.scenes.model import GRIPPER, INITIAL_JOINTS, TIMESTEP, WIPER
 from envs.manipulation.tasks import nut, wiping
@@ -23,7 +24,7 @@ WORLDS = ("table_wiping", "nut_assembly")
 
 @functools.cache
 def world(name):
-    make = {"table_wiping": wiping.make_table_wiping, "nut_assembly": nut.make_nut_assembly}[name]
+    make = {"table_wiping": make_table_wiping, "nut_assembly": make_nut_assembly}[name]
     return make(range(8), range(1000, 1008))
 
 
@@ -67,7 +68,7 @@ def arm_values(q, v, tool):
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_arm_is_c_mujocos(mujoco, name):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     twin = make_twin(world(name)).arm
     tool, model, data = (WIPER if name == "table_wiping" else GRIPPER), twin.model, twin.data
@@ -140,7 +141,7 @@ def pressed_state():
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_twin_moves_alike_in_the_air(mujoco, name):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world(name), make_twin(world(name))
     ours = theirs = start(name)
@@ -154,7 +155,7 @@ def test_twin_moves_alike_in_the_air(mujoco, name):
 
 
 def test_twin_presses_alike(mujoco):
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world("table_wiping"), make_twin(world("table_wiping"))
     act = expert_action("table_wiping")
@@ -173,7 +174,7 @@ def test_twin_presses_alike(mujoco):
 @pytest.mark.parametrize("index", [0, 1, 3])
 def test_twin_grasps_alike(mujoco, index):
     """The ring is lifted in both by the same commands, and stays within 5 mm of the other's."""
-    from envs.manipulation.physics.mujoco_c import make_twin
+    from envs.manipulation.twins import make_twin
 
     env, twin = world("nut_assembly"), make_twin(world("nut_assembly"))
     act, step = expert_action("nut_assembly"), transition("nut_assembly")

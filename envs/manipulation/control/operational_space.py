@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import (
-    Frames,
     Matrix,
+    Motion,
     Vector,
     add,
+    bias_torque,
     combine,
     cross,
     dot,
+    drag,
     frames,
     jacobian,
+    joint_torque,
     mass_matrix,
     scale,
+    twist_of,
 )
 from envs.manipulation.scenes.model import (
-    AIR_DENSITY,
-    AIR_VISCOSITY,
     DAMPING,
     FRICTION_LOSS,
+    SUBSTEPS,
+    TIMESTEP,
     TORQUE_LIMIT,
     Tool,
 )
@@ -76,56 +81,6 @@ def any_nonzero(values: list[Scalar]) -> Scalar:
     for value in values[1:]:
         found = found | (value != 0)
     return found
-
-
-class Motion(NamedTuple):
-    """The arm at the start of a physics step.
-
-    Attributes:
-        at: Kinematics.
-        columns: Jacobian of the grip site, per joint (linear, angular).
-        twist: Velocity of the grip site, m/s and rad/s.
-        matrix: Mass matrix.
-        acceleration: Of the joints, without contact, rad/s^2.
-        speeds: Of the joints, rad/s.
-    """
-
-    at: Frames
-    columns: list[tuple[Vector, Vector]]
-    twist: tuple[Vector, Vector]
-    matrix: unrolled_linalg.Rows
-    acceleration: list[Scalar]
-    speeds: list[Scalar]
-
-
-def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple[Vector, Vector]:
-    """The product J rates."""
-    linear = angular = (0.0, 0.0, 0.0)
-    for (a, b), rate in zip(columns, rates, strict=True):
-        linear, angular = add(linear, scale(rate, a)), add(angular, scale(rate, b))
-    return linear, angular
-
-
-def joint_torque(columns: list[tuple[Vector, Vector]], force: Vector, torque: Vector):
-    """The product J' [force, torque]."""
-    return [dot(a, force) + dot(b, torque) for a, b in columns]
-
-
-def drag(tool: Tool, rotation: Matrix, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-    """Force and torque of the air on the tool (MuJoCo's inertia-box model).
-
-    The wiper's nominal inertia makes it a box of 1.4 m: at 1 rad/s the air brakes it by 0.2 N m.
-    """
-    side = tool.box
-    result = []
-    for vector, quadratic, viscous in (
-        (twist[0], 0.5 * AIR_DENSITY * side**2, 3 * jnp.pi * side * AIR_VISCOSITY),
-        (twist[1], AIR_DENSITY * side**5 / 32, jnp.pi * side**3 * AIR_VISCOSITY),
-    ):
-        local = tuple(dot(axis, vector) for axis in rotation)
-        local = tuple(-(quadratic * jnp.abs(v) + viscous) * v for v in local)
-        result.append(combine(rotation, local))
-    return result[0], result[1]
 
 
 def free_motion(
@@ -183,5 +138,40 @@ def free_motion(
         brake = DAMPING * speeds[index] + FRICTION_LOSS * jnp.tanh(speeds[index] / _SETTLING)
         net.append(applied + air[index] - brake)
     return Motion(
-        at, columns, (linear, angular), matrix, unrolled_linalg.solve(factor, net), speeds
+        at=at,
+        columns=columns,
+        twist=(linear, angular),
+        matrix=matrix,
+        acceleration=unrolled_linalg.solve(factor, net),
+        speeds=speeds,
     )
+
+
+def free_steps(
+    joints: jax.Array, speeds: jax.Array, action: jax.Array, held: jax.Array, tool: Tool
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """One control step of 0.05 s of an arm that nothing touches: 25 steps of 2 ms.
+
+    Args:
+        joints, speeds: [6] rad, rad/s.
+        action: [6] in [-1, 1]: shift and turn of the grip site.
+        held: [3, 3] rows are the axes of the last orientation goal.
+        tool: In the hand.
+
+    Returns:
+        Joints, speeds and the new orientation goal.
+    """
+    at = unrolled_linalg.materialize(frames(list(joints), tool))
+    action = jnp.clip(action, -1.0, 1.0)
+    last = (tuple(held[0]), tuple(held[1]), tuple(held[2]))
+    goal = unrolled_linalg.materialize(new_goal(list(action), at.position, at.rotation, last))
+    weight = unrolled_linalg.materialize(bias_torque(at, tool, list(speeds)))
+
+    def step(carry: tuple[jax.Array, jax.Array], _: None) -> Any:
+        joints, speeds = carry
+        motion = free_motion(list(joints), list(speeds), goal, tool, weight)
+        speeds = speeds + TIMESTEP * jnp.stack(motion.acceleration)
+        return (joints + TIMESTEP * speeds, speeds), None
+
+    joints, speeds = jax.lax.scan(step, (joints, speeds), None, length=SUBSTEPS)[0]
+    return joints, speeds, unrolled_linalg.array(goal[1])

@@ -14,7 +14,7 @@ from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.scenes.model import GRIPPER, PEG
 from envs.manipulation.tasks.base import lagged_frames
 from envs.manipulation.tasks.nut import (
-    _BASE,
+    BASE,
     PLACE_Z,
     NutParams,
     NutState,
@@ -48,7 +48,7 @@ def scripted_expert(
     """Action [7]: hover over the handle, descend, grasp, lift, carry, lower onto the peg."""
     del key, observation, params
     at = lagged_frames(state, GRIPPER)
-    eef = jnp.stack(at.position) + _BASE
+    eef = jnp.stack(at.position) + BASE
     axes = unrolled_linalg.array(at.rotation)  # rows
     position, quaternion = lagged_ring(state)
     ring = rotation_matrix(quaternion)

@@ -16,7 +16,7 @@ from envs.manipulation.physics.analytic.arm import cross
 from envs.manipulation.scenes.model import WIPER
 from envs.manipulation.tasks.base import lagged_frames
 from envs.manipulation.tasks.wiping import (
-    _BASE,
+    BASE,
     WipingParams,
     WipingState,
     gap_below,
@@ -52,7 +52,7 @@ def scripted_expert(
     """Action [6]: keep the wiper level and pressed, and circle what is left of the dirt."""
     del key, observation, params
     at = lagged_frames(state, WIPER)
-    place = jnp.stack(at.position)[:2] + _BASE[:2]
+    place = jnp.stack(at.position)[:2] + BASE[:2]
     _, radius, centroid = remaining(state.markers, state.wiped)
     away = place - centroid[:2]
     command = _circle(away, radius)

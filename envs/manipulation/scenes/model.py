@@ -1,8 +1,8 @@
-"""The two scenes as MJCF, built from the tabulated UR5e; and indices into them.
+"""The scenes as MJCF, built from the tabulated UR5e.
 
 Kinematics, inertias, armature, limits and contact parameters are robosuite 1.4.1's; every shape is
 a primitive. What MuJoCo collides is only what the named `<pair>`s list: the tool with what it
-works on. Contacts of the arm itself end an episode and are found by distance (`links.py`).
+works on. Contacts of the arm itself end an episode and are found by distance (`collision.py`).
 """
 
 from __future__ import annotations
@@ -207,6 +207,28 @@ def _pair(name: str, first: str, second: str, friction: float, soft: str) -> str
     )
 
 
+def arm_scene(
+    *,
+    tool: Tool,
+    base: tuple[float, float, float],
+    table: tuple[tuple[float, float], tuple[float, float], float],
+    held: str = "",
+    bodies: str = "",
+    pairs: str = "",
+) -> str:
+    """MJCF of a scene of one's own: the arm behind a table.
+
+    Args:
+        tool: In the hand: mass, inertia and grip site.
+        base: Of the arm in world axes, m.
+        table: Centre and half size of its top, m, and the height, m.
+        held: MJCF of the tool's shapes, in the hand's frame. Class "shown" is drawn only.
+        bodies: MJCF of what else is there.
+        pairs: MJCF of the contact pairs that C MuJoCo is to collide.
+    """
+    return _scene(_arm(_inertial(tool) + held, base) + _table(table) + bodies, pairs)
+
+
 def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -> str:
     """MJCF of table wiping.
 
@@ -240,7 +262,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
 def nut_scene(beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, friction: float) -> str:
     """MJCF of nut assembly.
 
-    The inner fingers are fixed to the knuckles here; `twin.py` turns them, and moves the pads'
+    The inner fingers are fixed to the knuckles here; `twins.py` turns them, and moves the pads'
     points, as the gripper's state says.
 
     Args:

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control import gripper, operational_space
-from envs.manipulation.control.quaternion import hand_quaternion, multiply
-from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import bias_torque, frames
+from envs.manipulation.control import operational_space
+from envs.manipulation.physics.analytic import gripper, unrolled_linalg
+from envs.manipulation.physics.analytic.arm import bias_torque, frames, jacobian, twist_of
 from envs.manipulation.physics.analytic.grasp_contact import Ring, hold
+from envs.manipulation.physics.analytic.quaternion import hand_quaternion, multiply
 from envs.manipulation.scenes.model import (
     GRIPPER,
     HANDLE,
@@ -22,13 +22,11 @@ from envs.manipulation.scenes.model import (
     SUBSTEPS,
     TIMESTEP,
 )
-from envs.manipulation.tasks.base import ArmWorld, lagged_frames
-from ppl_jax.types import EnvSpec, Expert, Outcome
+from envs.manipulation.tasks.base import ArmTask, lagged_frames
+from ppl_jax.types import EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 51, 7
 HORIZON = 1000  # control steps of 0.05 s
-TRAINING_SCENARIOS = range(1000)
-HELD_OUT_SCENARIOS = range(1000, 1050)
 
 # reward and success (robosuite 1.4.1, environments/manipulation/nut_assembly.py)
 REACH, GRASP, LIFT, HOVER = 0.1, 0.35, 0.5, 0.7
@@ -39,7 +37,7 @@ PRESENCE = 0.6  # largest 1 - tanh(10 distance) of gripper to ring for success
 PLACE_X, PLACE_Y, PLACE_Z = (-0.115, -0.11), (-0.225, -0.11), 0.89  # m, where the ring starts
 FALLEN = 0.75  # m, below which the ring has left the table for good
 
-_BASE = np.array(NUT_BASE, np.float32)
+BASE = np.array(NUT_BASE, np.float32)
 
 
 @flax.struct.dataclass
@@ -148,7 +146,7 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
         motion = operational_space.free_motion(
             list(s.joints), list(s.speeds), goal, GRIPPER, weight
         )
-        ring = Ring(s.position - _BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
+        ring = Ring(s.position - BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
         knuckles, inner = s.fingers[::3], s.fingers[1::3]
         result = hold(
             motion,
@@ -227,21 +225,14 @@ SCALE = np.concatenate(
 ).astype(np.float32)  # fmt: skip
 
 
-class NutAssembly(ArmWorld):
+class NutAssembly(ArmTask):
     """Nut assembly as pure functions. Build one with `make_nut_assembly`."""
 
     name = "nut_assembly"
     spec = EnvSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
     max_episode_steps = HORIZON
     tool = GRIPPER
-    base = _BASE
-
-    @property
-    def scripted_expert(self) -> Expert:
-        """The world's default expert."""
-        from envs.manipulation.experts.nut import scripted_expert
-
-        return scripted_expert
+    base = BASE
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: NutParams) -> NutState:
         """The start of scenario `index` of the pool."""
@@ -284,7 +275,7 @@ class NutAssembly(ArmWorld):
         new = jax.tree.map(lambda a, b: jnp.where(physics_diverged, b, a), moved, state)
         new = new.replace(time=state.time + 1)
         at = lagged_frames(new, GRIPPER)
-        eef = jnp.stack(at.position) + _BASE
+        eef = jnp.stack(at.position) + BASE
         position, quaternion = lagged_ring(new)
         staged, on = stages(eef, position, handle_of(position, quaternion), new.touching, new.time)
         near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
@@ -301,13 +292,13 @@ class NutAssembly(ArmWorld):
             success=success,
             unsafe=fallen,
             progress=jnp.where(success, 1.0, jnp.max(staged)),
-            speed=jnp.linalg.norm(
-                jnp.stack(
-                    operational_space.twist_of(operational_space.jacobian(at), list(new.speeds))[0]
-                )
-            ),
+            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(new.speeds))[0])),
             physics_diverged=physics_diverged,
         )
+
+    def readings(self, state: NutState) -> list[tuple[str, str]]:
+        """Whether the ring is held."""
+        return [("ring held", "yes" if bool(state.touching) else "no")]
 
     def observe(self, state: NutState, params: NutParams) -> jax.Array:
         """The 51 values, in robosuite 1.4.1's order.
@@ -318,7 +309,7 @@ class NutAssembly(ArmWorld):
         """
         lagged = list(state.joints - TIMESTEP * state.speeds)
         at = frames(lagged, GRIPPER)
-        eef = jnp.stack(at.position) + _BASE
+        eef = jnp.stack(at.position) + BASE
         hand = hand_quaternion(lagged)
         position, quaternion = lagged_ring(state)
         back = (hand[3], -hand[0], -hand[1], -hand[2])
@@ -355,14 +346,3 @@ def make_params(numbers: range) -> NutParams:
     number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
     joints, place = jax.jit(jax.vmap(start))(number)
     return NutParams(joints.astype(jnp.float32), place, number, jnp.float32(1.0))
-
-
-def make_nut_assembly(
-    training: range = TRAINING_SCENARIOS, held_out: range = HELD_OUT_SCENARIOS
-) -> NutAssembly:
-    """Build the nut assembly world.
-
-    Args:
-        training, held_out: Numbers of the scenarios to train and to evaluate on.
-    """
-    return NutAssembly(make_params(training), make_params(held_out))

@@ -10,10 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation.control import operational_space
-from envs.manipulation.control.quaternion import hand_quaternion
 from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import Frames, bias_torque, frames
+from envs.manipulation.physics.analytic.arm import (
+    Frames,
+    bias_torque,
+    frames,
+    jacobian,
+    twist_of,
+)
 from envs.manipulation.physics.analytic.collision import arm_hits
+from envs.manipulation.physics.analytic.quaternion import hand_quaternion
 from envs.manipulation.physics.analytic.wipe_contact import POINTS, press
 from envs.manipulation.scenes.model import (
     INITIAL_JOINTS,
@@ -25,14 +31,12 @@ from envs.manipulation.scenes.model import (
     WIPING_BASE,
     WIPING_TABLE,
 )
-from envs.manipulation.tasks.base import ArmWorld, lagged_frames
+from envs.manipulation.tasks.base import ArmTask, lagged_frames
 from envs.manipulation.tasks.markers import COUNT, draw_markers
-from ppl_jax.types import EnvSpec, Expert, Outcome
+from ppl_jax.types import EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 34, 6
 HORIZON = 1000  # control steps of 0.05 s
-TRAINING_SCENARIOS = range(1000)
-HELD_OUT_SCENARIOS = range(1000, 1050)
 
 # reward (robosuite 1.4.1, environments/manipulation/wipe.py), before scaling
 WIPED, COMPLETE, CONTACT, COLLISION = 50.0, 25.5, 0.01, -10.0
@@ -45,10 +49,10 @@ HALF_FACE = (0.06, 0.025)  # m, of the rectangle of the wiper's corner spheres
 WIPE_DEPTH = 0.02  # m below which a marker under the face is not wiped
 LIMIT_MARGIN = 0.1  # rad before a joint's limit, where an episode ends
 
-_BASE = np.array(WIPING_BASE, np.float32)
+BASE = np.array(WIPING_BASE, np.float32)
 _CENTRE, _HALF, _TOP = WIPING_TABLE
 _TABLE = (
-    np.array(_CENTRE, np.float32) - _BASE[:2],
+    np.array(_CENTRE, np.float32) - BASE[:2],
     np.array(_HALF, np.float32),
     float(_TOP - WIPING_BASE[2]),
 )
@@ -226,21 +230,14 @@ SCALE = np.concatenate(
 ).astype(np.float32)  # fmt: skip
 
 
-class TableWiping(ArmWorld):
+class TableWiping(ArmTask):
     """Table wiping as pure functions. Build one with `make_table_wiping`."""
 
     name = "table_wiping"
     spec = EnvSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
     max_episode_steps = HORIZON
     tool = WIPER
-    base = _BASE
-
-    @property
-    def scripted_expert(self) -> Expert:
-        """The world's default expert."""
-        from envs.manipulation.experts.wiping import scripted_expert
-
-        return scripted_expert
+    base = BASE
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: WipingParams) -> WipingState:
         """The start of scenario `index` of the pool."""
@@ -304,13 +301,13 @@ class TableWiping(ArmWorld):
         at_limit = jnp.any(JOINT_LIMIT - jnp.abs(joints) < LIMIT_MARGIN)
         hit = arm_hits(at, _TOOL_ENDS, _TABLE)
         unsafe = hit | at_limit
-        newly = under_face(at, state.markers - _BASE[:2]) & ~state.wiped & (count > 0) & ~unsafe
+        newly = under_face(at, state.markers - BASE[:2]) & ~state.wiped & (count > 0) & ~unsafe
         wiped = state.wiped | newly
         reward = reward_of(
             jnp.sum(newly),
             wiped,
             state.markers,
-            jnp.stack(at.position) + _BASE,
+            jnp.stack(at.position) + BASE,
             jnp.linalg.norm(state.force),
             contact,
             count,
@@ -337,13 +334,17 @@ class TableWiping(ArmWorld):
             success=success,
             unsafe=unsafe,
             progress=jnp.mean(wiped.astype(jnp.float32)),
-            speed=jnp.linalg.norm(
-                jnp.stack(
-                    operational_space.twist_of(operational_space.jacobian(at), list(speeds))[0]
-                )
-            ),
+            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(speeds))[0])),
             physics_diverged=physics_diverged,
         )
+
+    def readings(self, state: WipingState) -> list[tuple[str, str]]:
+        """Markers left, and whether the wiper touches the table."""
+        left = COUNT - int(np.asarray(state.wiped).sum())
+        return [
+            ("dirt left", f"{left} of {COUNT}"),
+            ("touching", "yes" if bool(state.contact) else "no"),
+        ]
 
     def observe(self, state: WipingState, params: WipingParams) -> jax.Array:
         """The 34 values, in robosuite 1.4.1's order.
@@ -352,7 +353,7 @@ class TableWiping(ArmWorld):
         8-13 cos q, 14-19 sin q, 20-25 dq, 26-28 grip site, 29-32 hand (x y z w), 33 contact.
         """
         lagged = list(state.joints - TIMESTEP * state.speeds)
-        eef = jnp.stack(frames(lagged, WIPER).position) + _BASE
+        eef = jnp.stack(frames(lagged, WIPER).position) + BASE
         share, radius, centroid = remaining(state.markers, state.shown)
         return jnp.concatenate(
             [
@@ -380,14 +381,3 @@ def make_params(numbers: range) -> WipingParams:
     number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
     joints, markers = jax.jit(jax.vmap(start))(number)
     return WipingParams(joints.astype(jnp.float32), markers, number, jnp.float32(NORMALISATION))
-
-
-def make_table_wiping(
-    training: range = TRAINING_SCENARIOS, held_out: range = HELD_OUT_SCENARIOS
-) -> TableWiping:
-    """Build the wiping world.
-
-    Args:
-        training, held_out: Numbers of the scenarios to train and to evaluate on.
-    """
-    return TableWiping(make_params(training), make_params(held_out))

@@ -1,8 +1,8 @@
 """Kinematics and dynamics of a UR5e with a rigid tool, written out for its six joints.
 
-The same quantities as MuJoCo's (`tests/test_manipulation.py` compares them with C MuJoCo and MJX),
-but in scalars: under `vmap` each scalar becomes one vector over worlds, so that nothing is left in
-small trailing axes, which XLA does not vectorise on a CPU.
+The same quantities as MuJoCo's (`tests/worlds/test_manipulation.py` compares them with C MuJoCo and
+MJX), but in scalars: under `vmap` each scalar becomes one vector over environments, so that nothing
+is left in small trailing axes, which XLA does not vectorise on a CPU.
 """
 
 from __future__ import annotations
@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from envs.manipulation.scenes.model import ARMATURE, HAND, LINKS, Tool
+from envs.manipulation.scenes.model import (
+    AIR_DENSITY,
+    AIR_VISCOSITY,
+    ARMATURE,
+    HAND,
+    LINKS,
+    Tool,
+)
 
 Scalar = Any  # a float, or a traced scalar
 Vector = tuple[Scalar, Scalar, Scalar]
@@ -32,6 +39,26 @@ class Frames(NamedTuple):
     links: list[tuple[Vector, Matrix]]
     position: Vector
     rotation: Matrix
+
+
+class Motion(NamedTuple):
+    """The arm at the start of a physics step.
+
+    Attributes:
+        at: Kinematics.
+        columns: Jacobian of the grip site, per joint (linear, angular).
+        twist: Velocity of the grip site, m/s and rad/s.
+        matrix: Mass matrix.
+        acceleration: Of the joints, without contact, rad/s^2.
+        speeds: Of the joints, rad/s.
+    """
+
+    at: Frames
+    columns: list[tuple[Vector, Vector]]
+    twist: tuple[Vector, Vector]
+    matrix: list[list[Scalar]]
+    acceleration: list[Scalar]
+    speeds: list[Scalar]
 
 
 def add(a: Vector, b: Vector) -> Vector:
@@ -209,3 +236,33 @@ def bias_torque(at: Frames, tool: Tool, speeds: list[Scalar]) -> list[Scalar]:
         force, torque = add(force, wrenches[j][0]), add(torque, wrenches[j][1])
         result[j] = dot(at.axes[j], torque) + dot(cross(at.anchors[j], at.axes[j]), force)
     return result
+
+
+def twist_of(columns: list[tuple[Vector, Vector]], rates: list[Scalar]) -> tuple[Vector, Vector]:
+    """The product J rates."""
+    linear = angular = (0.0, 0.0, 0.0)
+    for (a, b), rate in zip(columns, rates, strict=True):
+        linear, angular = add(linear, scale(rate, a)), add(angular, scale(rate, b))
+    return linear, angular
+
+
+def joint_torque(columns: list[tuple[Vector, Vector]], force: Vector, torque: Vector):
+    """The product J' [force, torque]."""
+    return [dot(a, force) + dot(b, torque) for a, b in columns]
+
+
+def drag(tool: Tool, rotation: Matrix, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """Force and torque of the air on the tool (MuJoCo's inertia-box model).
+
+    The wiper's nominal inertia makes it a box of 1.4 m: at 1 rad/s the air brakes it by 0.2 N m.
+    """
+    side = tool.box
+    result = []
+    for vector, quadratic, viscous in (
+        (twist[0], 0.5 * AIR_DENSITY * side**2, 3 * jnp.pi * side * AIR_VISCOSITY),
+        (twist[1], AIR_DENSITY * side**5 / 32, jnp.pi * side**3 * AIR_VISCOSITY),
+    ):
+        local = tuple(dot(axis, vector) for axis in rotation)
+        local = tuple(-(quadratic * jnp.abs(v) + viscous) * v for v in local)
+        result.append(combine(rotation, local))
+    return result[0], result[1]

@@ -16,9 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control import gripper
-from envs.manipulation.control.operational_space import Motion
-from envs.manipulation.physics.analytic import unrolled_linalg
+from envs.manipulation.physics.analytic import gripper, unrolled_linalg
+from envs.manipulation.physics.analytic.arm import Motion
 from envs.manipulation.physics.analytic.contact import cone, cone_cost, cone_force
 from envs.manipulation.scenes.model import (
     HANDLE,

@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control.operational_space import Motion
 from envs.manipulation.physics.analytic import unrolled_linalg
-from envs.manipulation.physics.analytic.arm import cross
+from envs.manipulation.physics.analytic.arm import Motion, cross
 from envs.manipulation.physics.analytic.contact import cone, cone_force, impedance
 
 # Contact of one point. MuJoCo 2.3.7 reports half of the true depth for a box that lies flat on

@@ -1,0 +1,255 @@
+"""Everything that defines a run, as config.json holds it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from envs.registry import known, unknown
+from experiments.engine.runtime import UserError
+from ppl_jax import algorithms
+from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values
+from ppl_jax.gates import gate
+from ppl_jax.losses import NEEDS_REFERENCE
+from ppl_jax.predictors import predictor
+
+SCHEMA = 2  # of config.json; 1 had separate "config" and "hparams" under older names
+MAX_SEED = 2**32 - 1
+
+RENAMED = {
+    "max_doubt": "max_ensemble_variance",
+    "target_rate": "polyak_tau",
+}
+RENAMED_VALUES = {
+    "gate": {"departs": "deviates_from_expert", "unlikely": "action_probability"},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """Everything that defines a run; config.json holds it.
+
+    Attributes:
+        env, algorithm, seed: What is trained.
+        config, hparams: Static and traced settings.
+        expert: "scripted", "neural" (the shipped one), a policy file, "person" (see
+            `experiments.ui`) or "recorded PATH" of such a session.
+        reference_policy: Policy file of the objectives that have a reference.
+        scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
+        evaluate_on: "held_out" or (to choose settings by) "training".
+        evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
+    """
+
+    env: str
+    algorithm: str
+    seed: int
+    config: TrainConfig
+    hparams: HParams
+    expert: str = "scripted"
+    reference_policy: str | None = None
+    scenarios: str | None = None
+    held_out_scenarios: str | None = None
+    evaluate_every: int = 1000
+    evaluate_on: str = "held_out"
+
+    def as_json(self) -> dict[str, Any]:
+        """For config.json."""
+        content = {name: getattr(self, name) for name in _PLAIN}
+        return {"schema": SCHEMA} | content | {"settings": flat(self.config, self.hparams)}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> RunSettings:
+        """The inverse of `as_json`, of older versions too; ignores what else config.json holds.
+
+        Raises:
+            UserError: If it is of a newer version, or holds what no version has.
+        """
+        schema = content.get("schema", 1)
+        if schema > SCHEMA:
+            raise UserError(
+                f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
+                "written by a newer ppl-jax"
+            )
+        try:
+            given = {name: content[name] for name in _PLAIN}
+            found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
+            config, hparams = with_values(given["algorithm"], found)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"config.json cannot be read: {error}") from error
+        return RunSettings(**given, config=config, hparams=hparams)
+
+
+_PLAIN = tuple(
+    field.name
+    for field in dataclasses.fields(RunSettings)
+    if field.name not in ("config", "hparams")
+)
+
+
+def flat(config: TrainConfig, hparams: HParams) -> dict[str, Any]:
+    """Every setting by its flat name, as JSON has it: traced ones are floats."""
+    found = {}
+    for name, one in catalogue(config, hparams).items():
+        value = float(np.asarray(one.value)) if one.traced else one.value
+        found[name] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+def traced_values(settings: RunSettings) -> dict[str, float]:
+    """The traced settings of a run by name."""
+    mine = catalogue(settings.config, settings.hparams)
+    return {name: float(np.asarray(one.value)) for name, one in mine.items() if one.traced}
+
+
+def with_values(algorithm: str, given: Mapping[str, Any]) -> tuple[TrainConfig, HParams]:
+    """The settings of a run from all of their values.
+
+    Raises:
+        ValueError: If one is unknown.
+    """
+    spec = algorithms.method(algorithm)
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+    config = TrainConfig(method=spec.config())
+    hparams = HParams(
+        method=spec.hparams(),
+        gate=gate(given.get("gate", config.gate)).hparams(),
+        predictor=predictor(given.get("predictor", config.predictor)).hparams(),
+    )
+    return replace(config, hparams, **given)
+
+
+def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's config.json, of any version, as one level of names."""
+    of_a_method = content.get("algorithm") in algorithms.registered()
+    if of_a_method and content.get("schema", 1) == 1:
+        found = {**content, "settings": _of_schema_1(content)}
+        content = {k: v for k, v in found.items() if k not in ("config", "hparams")}
+    flat_content: dict[str, Any] = {}
+    for name, value in content.items():
+        nested = isinstance(value, dict) and name in ("settings", "config", "hparams")
+        flat_content |= value if nested else {name: value}
+    return flat_content
+
+
+def _of_schema_1(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings in a config.json of the first version, under today's names.
+
+    It held the settings of all methods and gates; those that are not this run's are left out.
+    """
+    old = {**content["config"], **content["hparams"]}
+    found = {RENAMED.get(name, name): value for name, value in old.items()}
+    for name, renamed in RENAMED_VALUES.items():
+        found[name] = renamed.get(found[name], found[name])
+    spec = algorithms.method(content["algorithm"])
+    hparams = HParams(
+        method=spec.hparams(),
+        gate=gate(found["gate"]).hparams(),
+        predictor=predictor(found["predictor"]).hparams(),
+    )
+    mine = values(TrainConfig(method=spec.config()), hparams)
+    return {name: value for name, value in found.items() if name in mine}
+
+
+def default_interval(config: TrainConfig) -> int:
+    """A tenth of what follows the demonstrations, in whole decisions."""
+    steps = config.total_steps - config.demonstrations
+    return max(steps // 10 // config.decision_interval, 1) * config.decision_interval
+
+
+def run_settings(
+    env: str,
+    algorithm: str = "ppl",
+    seed: int = 0,
+    *,
+    preset: str = "default",
+    expert: str = "scripted",
+    reference_policy: str | None = None,
+    scenarios: str | None = None,
+    held_out_scenarios: str | None = None,
+    evaluate_on: str = "held_out",
+    evaluate_every: int | None = None,
+    given: Mapping[str, Any] | None = None,
+) -> RunSettings:
+    """The settings of a run from what somebody asked for.
+
+    Args:
+        env, algorithm, seed, expert, reference_policy, scenarios, held_out_scenarios, evaluate_on:
+            See `RunSettings`.
+        preset: "default", "paper" or "reference".
+        evaluate_every: Steps between evaluations; a tenth of the run where None.
+        given: Settings by their flat names.
+
+    Raises:
+        UserError: One line naming field, value and what is allowed.
+    """
+    from experiments.engine.recorded import length_of, recording_of
+
+    if not known(env):
+        raise UserError(unknown(env))
+    given = dict(given or {})
+    try:
+        config, _ = algorithms.settings(algorithm, env, preset)
+        if expert == "recorded":
+            raise UserError("expert recorded needs the session: --expert recorded PATH")
+        if (path := recording_of(expert)) is not None:
+            whole = length_of(path, env) // config.decision_interval
+            given.setdefault("total_steps", whole * config.decision_interval)
+        if "total_steps" in given and "demonstrations" not in given:
+            given["demonstrations"] = min(config.demonstrations, max(given["total_steps"], 0))
+            if not given["demonstrations"]:
+                given.setdefault("offline_updates", 0)
+        config, hparams = algorithms.settings(algorithm, env, preset, **given)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return RunSettings(
+        env=env,
+        algorithm=algorithm,
+        seed=seed,
+        config=config,
+        hparams=hparams,
+        expert=expert,
+        reference_policy=reference_policy,
+        scenarios=scenarios,
+        held_out_scenarios=held_out_scenarios,
+        evaluate_on=evaluate_on,
+        evaluate_every=default_interval(config) if evaluate_every is None else evaluate_every,
+    )
+
+
+def check(settings: RunSettings) -> None:
+    """Refuse what cannot work, before anything is built.
+
+    Raises:
+        UserError: One line naming field, value and what is allowed.
+    """
+    if not known(settings.env):
+        raise UserError(unknown(settings.env))
+    if not 0 <= settings.seed <= MAX_SEED:
+        allowed = "not be negative" if settings.seed < 0 else f"be at most {MAX_SEED}"
+        raise UserError(f"seed must {allowed}, got {settings.seed}")
+    interval = settings.config.decision_interval
+    try:
+        algorithms.method(settings.algorithm)
+        validate(settings.config, settings.hparams)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    if settings.evaluate_every < 1 or settings.evaluate_every % interval:
+        raise UserError(
+            f"evaluate_every must be a positive multiple of decision_interval ({interval}), got "
+            f"{settings.evaluate_every}"
+        )
+    objective = getattr(settings.config.method, "objective", None)
+    needs = objective in NEEDS_REFERENCE
+    if needs and settings.reference_policy is None:
+        raise UserError(
+            f"objective {objective!r} needs a reference policy: give "
+            "--reference-policy FILE, a policy trained by --algorithm bc, for one"
+        )
+    if settings.reference_policy is not None and not needs:
+        raise UserError(
+            f"reference_policy is for ppl with objective {' or '.join(NEEDS_REFERENCE)}, got "
+            f"{settings.algorithm} with {objective}"
+        )

@@ -1,0 +1,1 @@
+"""A manipulation scene of your own in three files: scene, task and expert."""

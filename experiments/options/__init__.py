@@ -1,0 +1,1 @@
+"""What the commands take, generated from the settings classes."""

@@ -1,0 +1,482 @@
+"""What the commands take beside the settings of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, subcommand
+
+
+@dataclasses.dataclass
+class Evaluate:
+    """Play every held-out scenario once with a trained policy."""
+
+    run: Positional[Path]
+    """Run folder, or an exported policy file."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to play instead of the run's own held-out ones."""
+    out: Path | None = None
+    """Write one row per scenario to this CSV file."""
+
+
+@dataclasses.dataclass
+class Compare:
+    """Train all methods with the same seeds; one table."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: all)."""
+    seeds: tuple[str, ...] = ("5",)
+    """How many (5), which (3 7 11) or a range (10-19); each method the same."""
+    total_steps: int | None = None
+    """Environment steps of each run (bc and gail keep their own)."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    gate: str | None = None
+    """What makes the expert take over (default: the paper's rule for the world)."""
+    min_return: float | None = None
+    """Gate low_return: predicted return at or below which the expert takes over."""
+    max_departure: float | None = None
+    """Gate deviates_from_expert: how far from the expert's own path, in the world's units."""
+    min_log_density: float | None = None
+    """Gate action_probability: log-density under a neural expert below which it takes over."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
+    processes: int = 2
+    """Runs at the same time; as many as there are cores get one each."""
+    out: Path = Path("compare")
+    """Folder of the runs and result files; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Ablation:
+    """Train the ten rows of the paper's ablation with the same seeds; one table."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    seeds: tuple[str, ...] = ("5",)
+    """How many (5), which (3 7 11) or a range (10-19); each row the same."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    reference_steps: int = 10_000
+    """Expert steps that the reference policy of DPO and IPO clones."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
+    processes: int = 2
+    """Runs at the same time; as many as there are cores get one each."""
+    out: Path = Path("ablation")
+    """Folder of the runs and result files; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Tune:
+    """Try the declared grid of every method, on training scenarios; one table."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: all)."""
+    seeds: tuple[str, ...] = ("2",)
+    """How many (5), which (3 7 11) or a range (10-19)."""
+    total_steps: int = 3000
+    """Environment steps of each run (bc keeps its own)."""
+    evaluate_every: int = 1000
+    """Steps between evaluations."""
+    gail_steps: int = 120_000
+    """Environment steps of gail."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    expert: str | None = None
+    """scripted (the default), neural (the shipped one), or a policy file or run folder."""
+    processes: int = 2
+    """Runs at the same time; as many as there are cores get one each."""
+    out: Path = Path("tune")
+    """Folder of the runs and of tuning.csv; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class ExpertTrain:
+    """Train a neural expert by PPO-Lagrangian: progress, then the evaluation table; a run folder.
+
+    Defaults are those of the world's shipped expert.
+    """
+
+    env: Positional[str]
+    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
+    seed: int = 0
+    """Random seed."""
+    total_steps: int | None = None
+    """Environment steps."""
+    num_envs: int | None = None
+    """Worlds stepped side by side."""
+    rollout_steps: int | None = None
+    """Steps of each world per batch."""
+    epochs: int | None = None
+    """Passes over a batch."""
+    num_minibatches: int | None = None
+    """Updates per pass."""
+    hidden: tuple[int, ...] | None = None
+    """Widths of the hidden layers of policy and critics."""
+    scaling: Literal["running", "world"] | None = None
+    """Inputs are scaled by running statistics, or by the world's constants."""
+    demonstrations: int | None = None
+    """Steps that the scripted expert labels, under noise, and that the policy clones first."""
+    demonstration_stride: int | None = None
+    """Of these every so many are kept."""
+    demonstration_rounds: int | None = None
+    """Rounds of these: the expert plays the first, the clone the others."""
+    cloning: Literal["laplace", "gaussian"] | None = None
+    """Likelihood that is cloned: for the median or the mean of what the expert does."""
+    cloning_updates: int | None = None
+    """Updates of that."""
+    demonstration_noise: float | None = None
+    """Standard deviation of that noise."""
+    guided: bool | None = None
+    """The expert also says at every step of the training what it would do."""
+    guidance_weight: float | None = None
+    """Of the distance from that."""
+    critic_batches: int | None = None
+    """Batches at the start in which only the critics learn."""
+    learning_rate: float | None = None
+    """Of Adam; falls linearly to 0."""
+    discount: float | None = None
+    """gamma of the reward."""
+    cost_discount: float | None = None
+    """gamma of the cost."""
+    gae_lambda: float | None = None
+    """lambda of the generalised advantages."""
+    clip: float | None = None
+    """PPO's bound on the ratio."""
+    target_kl: float | None = None
+    """KL at which a batch's policy updates stop."""
+    max_grad_norm: float | None = None
+    """Norm to which gradients are clipped."""
+    entropy_coef: float | None = None
+    """Weight of the policy's entropy."""
+    cost_limit: float | None = None
+    """Mean cost per episode that is allowed."""
+    terminate_on_cost: float | None = None
+    """1 where nothing is worth anything after a step that costs, 0 otherwise."""
+    initial_multiplier: float | None = None
+    """Of the cost, at the start."""
+    lagrangian_lr: float | None = None
+    """Adam's rate for the multiplier."""
+    initial_std: float | None = None
+    """Standard deviation of the actions at the start."""
+    min_std: float | None = None
+    """Standard deviation of the actions at least."""
+    final_std: float | None = None
+    """Bound on it at the end."""
+    success_bonus: float | None = None
+    """Reward for solving the task, while training."""
+    training_scenarios: int | None = None
+    """Generated scenarios to train on, numbered from 10,000; 0 for the novice's."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
+    evaluate_every: int | None = None
+    """Batches between evaluations and checkpoints (default: a fortieth of the run)."""
+    out: Path | None = None
+    """Run folder (default: runs/ENV-expert-SEED-TIME)."""
+    resume: bool = False
+    """Go on with the run in --out."""
+
+
+@dataclasses.dataclass
+class ExpertEvaluate:
+    """Play every held-out scenario once with an expert."""
+
+    env: Positional[str]
+    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
+    kind: str = "neural"
+    """neural (the shipped one), scripted, or a policy file or run folder."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to play instead of the held-out ones."""
+    out: Path | None = None
+    """Write one row per scenario to this CSV file."""
+
+
+@dataclasses.dataclass
+class ExpertCard:
+    """Write a trained expert's policy, its curve and a card that says how it was made."""
+
+    run: Positional[Path]
+    """Run folder of `ppl expert train`."""
+    out: Path = Path("expert_card")
+    """Folder to write to; never the package's own `envs/pretrained`."""
+    force: bool = False
+    """Replace the files of an earlier card in --out."""
+
+
+@dataclasses.dataclass
+class Sweep:
+    """Train every combination of settings with every seed; resumes.
+
+    Give several values of any setting, or a study that names them.
+    """
+
+    envs: Positional[tuple[str, ...]]
+    """Worlds: driving, table_wiping, nut_assembly."""
+    study: str | None = None
+    """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
+    Values given replace the study's."""
+    algorithms: tuple[str, ...] = ()
+    """Methods (default: ppl, or the study's)."""
+    seeds: tuple[str, ...] = ("5",)
+    """How many (5), which (3 7 11) or a range (10-19); the same everywhere."""
+    preset: Literal["default", "paper", "reference"] = "default"
+    """Settings to start from."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a tenth of the run)."""
+    expert: str = "scripted"
+    """scripted, neural (the shipped one), or a policy file or run folder."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    held_out_scenarios: str | None = None
+    """Folder of recorded scenarios to evaluate on."""
+    axes: Suppress[Fixed[dict[str, tuple[Any, ...]]]] = dataclasses.field(default_factory=dict)
+    """Values of the settings."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
+    address: str | None = None
+    """Engine ray: of a running cluster (default: one on this machine)."""
+    processes: int = 2
+    """Engine local, on a CPU: runs at the same time; as many as there are cores get one each."""
+    batch: int | None = None
+    """Runs per program (default: one on a CPU, on accelerators what memory holds)."""
+    dry_run: bool = False
+    """Say how much work it is, and stop."""
+    out: Path = Path("sweep")
+    """Folder of the result files; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Robustness(Sweep):
+    """Train under noise on predicted states (or on the expert's actions); resumes."""
+
+    study: Literal["prediction_noise", "expert_noise"] = "prediction_noise"
+    """Whose noise."""
+    out: Path = Path("robustness")
+    """Folder of the result files; finished runs in it are kept."""
+
+
+@dataclasses.dataclass
+class Expert:
+    """Train, evaluate or describe an expert."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[ExpertTrain, subcommand("train")]
+        | Annotated[ExpertEvaluate, subcommand("evaluate")]
+        | Annotated[ExpertCard, subcommand("card")]
+    ]
+    """What to do."""
+
+
+@dataclasses.dataclass
+class Horizon:
+    """Measure along runs of ppl what a longer preference horizon buys and costs."""
+
+    env: Positional[str]
+    """World: driving, table_wiping or nut_assembly."""
+    seeds: tuple[str, ...] = ("3",)
+    """How many (5), which (3 7 11) or a range (10-19); one run each."""
+    total_steps: int | None = None
+    """Environment steps of each run."""
+    measure_every: int | None = None
+    """Steps between measurements (default: a fifth of the run)."""
+    batch_size: int | None = None
+    """Samples per loss and update."""
+    expert: str = "scripted"
+    """scripted, neural (the shipped one), or a policy file or run folder."""
+    out: Path = Path("horizon.csv")
+    """File to write."""
+
+
+@dataclasses.dataclass
+class Table:
+    """Print results as a table: Markdown, LaTeX or plain."""
+
+    results: Positional[Path]
+    """Run folder; folder of ppl sweep, compare, ablation or tune; or its results.csv."""
+    step: int | None = None
+    """Environment steps (default: the end of each run; all of a single run)."""
+    format: Literal["text", "markdown", "latex"] = "text"
+    """How to write it."""
+    against: str | None = None
+    """Row that the others are compared with, such as "ppl beta=0.1" (default: the default settings
+    where they are there, else the first row)."""
+    paper: bool = False
+    """Show the paper's own figures beside ours."""
+    env: str | None = None
+    """World of results that do not name theirs (those of ppl compare)."""
+
+
+@dataclasses.dataclass
+class Figure:
+    """Draw results."""
+
+    results: Positional[Path]
+    """Run folder; folder of ppl sweep, compare, ablation or tune, or its results.csv; a folder of
+    experts' cards; or (kind steering) a policy file."""
+    other: Positional[tuple[Path, ...]] = ()
+    """Kind steering: more of them; kind horizon: results over L, to show beside."""
+    kind: (
+        Literal["curves", "axis", "heatmap", "training", "experts", "steering", "horizon"] | None
+    ) = None
+    """Learning curves; success over one setting, or two; takeovers and cost in training; training
+    of experts; steering on one map; what L buys and costs (default: what the results have)."""
+    column: Literal["success", "progress", "episodic_return", "episodic_cost"] = "success"
+    """What is drawn."""
+    steps: tuple[int, ...] = ()
+    """Kind axis: steps to draw (default: the end of each run)."""
+    scenario: int = 1000
+    """Kind steering: number of a held-out scenario."""
+    out: Path = Path("figure.png")
+    """File to write; its ending decides how."""
+
+
+@dataclasses.dataclass
+class Export:
+    """Write a run's policy as one file that plain NumPy can run."""
+
+    run: Positional[Path]
+    """Run folder."""
+    out: Path = Path("policy.npz")
+    """File to write."""
+
+
+@dataclasses.dataclass
+class Render:
+    """Draw one episode of a policy as GIF, MP4 or PNG (the file's ending decides)."""
+
+    run: Positional[str]
+    """Run folder, policy file, "scripted" or "neural"."""
+    scenario: int = 1000
+    """Number of a held-out scenario."""
+    out: Path = Path("episode.gif")
+    """File to write."""
+    steps: int = 600
+    """At most so many steps."""
+    env: str = "driving"
+    """World of "scripted" and "neural": driving, table_wiping or nut_assembly."""
+
+
+@dataclasses.dataclass
+class Play:
+    """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
+
+    env: Positional[str | None] = None
+    """Environment (`ppl list` names them); with --resume that of the folder."""
+    algorithm: str = "ppl"
+    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
+    seed: int = 0
+    """Random seed."""
+    total_steps: int | None = None
+    """Steps of the session."""
+    preference_horizon: int | Literal["auto"] | None = None
+    """L: predicted states that get a preference pair."""
+    beta: float | None = None
+    """Temperature of the preference loss."""
+    learning_rate: float | None = None
+    """Of Adam."""
+    manual_episodes: int = 0
+    """Number of episodes at the start in which you make every step."""
+    participant: str = ""
+    """Your name in a study: at most 32 letters, digits, - and _."""
+    consent: Path | None = None
+    """Text file to agree to before anything starts."""
+    familiarisation: int = 0
+    """Successes in a row, driving alone, before steps count (the paper: 10)."""
+    questions: Path | None = None
+    """JSON file of questions asked after every episode."""
+    rate: float | None = None
+    """Steps per second (default: the environment's own, 10 in driving and 20 for the arm)."""
+    scenarios: str | None = None
+    """Folder of recorded scenarios to train on."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    expose: bool = False
+    """Allow a host that others on the network can reach."""
+    evaluate: bool = True
+    """Play the held-out scenarios at the end."""
+    out: Path | None = None
+    """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
+    resume: bool = False
+    """Continue the session in --out; its settings come from there."""
+    words: Suppress[tuple[str, ...]] = ()
+
+
+@dataclasses.dataclass
+class Replay:
+    """Watch a recorded session in a browser."""
+
+    recording: Positional[Path]
+    """Run folder of `ppl play`, or an exported session."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    expose: bool = False
+    """Allow a host that others on the network can reach."""
+
+
+@dataclasses.dataclass
+class Recording:
+    """Write a session of `ppl play` as one file that NumPy (or Minari) can read."""
+
+    run: Positional[Path]
+    """Run folder."""
+    out: Path = Path("session.npz")
+    """File to write."""
+    minari: str | None = None
+    """Write a Minari data set of this name instead, such as driving/person-v0."""
+
+
+@dataclasses.dataclass
+class Bench:
+    """Measure speed, as ratios within one run."""
+
+    repeats: int = 5
+    """Repeats of each figure; medians are reported."""
+    parts: tuple[Literal["worlds", "training", "experts", "methods", "seeds", "sweep"], ...] = (
+        "worlds",
+        "training",
+        "experts",
+        "methods",
+    )
+    """What to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
+    against single ones) take long."""
+    out: Path | None = None
+    """Also write the figures to this JSON file."""
+
+
+@dataclasses.dataclass
+class Doctor:
+    """Say what this machine has, and what to do about what is missing."""
+
+
+@dataclasses.dataclass
+class List:
+    """Name the environments, methods, gates, predictors, objectives, studies, presets, experts."""

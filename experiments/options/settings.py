@@ -1,0 +1,203 @@
+"""Options of the command line generated from the settings classes."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+
+from envs.registry import known, registered
+from experiments.engine.runtime import UserError
+from experiments.engine.settings import RENAMED, RENAMED_VALUES
+from ppl_jax import algorithms
+from ppl_jax.config import Setting, catalogue
+from ppl_jax.gates import registered_gates
+from ppl_jax.predictors import registered_predictors
+
+GROUPS = ("run", "method", "gate", "predictor", "expert", "evaluation", "output")
+HELP_ALL = "--help-all"
+
+
+def word_after(argv: Sequence[str], option: str) -> str | None:
+    """The value of `--option value` or `--option=value` in a command line."""
+    found = words_after(argv, option)
+    return found[-1] if found else None
+
+
+def words_after(argv: Sequence[str], option: str) -> list[str]:
+    """All values of an option that may take several."""
+    found: list[str] = []
+    taking = False
+    for word in argv:
+        if word.startswith("--"):
+            name, has_value, value = word.partition("=")
+            taking = name.replace("_", "-") == option
+            if taking and has_value:
+                found.append(value)
+        elif taking:
+            found.append(word)
+    return found
+
+
+def environments_in(argv: Sequence[str]) -> list[str]:
+    """The known environments that a command line names."""
+    return [word for word in argv if not word.startswith("-") and known(word)]
+
+
+def settings_in(argv: Sequence[str], preset: str = "default") -> dict[str, Setting]:
+    """The settings of the runs that a command line asks for, with the values they would have.
+
+    Raises:
+        UserError: If a method, gate, predictor or preset is unknown, or an old name is used.
+    """
+    refuse_old_names(argv)
+    env = (environments_in(argv) or ["driving"])[0]
+    methods = words_after(argv, "--algorithms") or [word_after(argv, "--algorithm") or "ppl"]
+    preset = word_after(argv, "--preset") or preset
+    several = {name: words_after(argv, f"--{name}") or [None] for name in ("gate", "predictor")}
+    found: dict[str, Setting] = {}
+    try:
+        for method in methods:
+            for gate in several["gate"]:
+                for predictor in several["predictor"]:
+                    given = {"gate": gate, "predictor": predictor}
+                    given = {name: value for name, value in given.items() if value is not None}
+                    made = algorithms.settings(method, env, preset, **given)
+                    mine = catalogue(*made)
+                    if not algorithms.method(method).gated:
+                        mine = {k: s for k, s in mine.items() if s.about.group != "gate"}
+                        mine["decision_interval"] = catalogue(*made)["decision_interval"]
+                    found = mine | found
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return found
+
+
+def refuse_old_names(argv: Sequence[str]) -> None:
+    """Refuse settings and values under the names they had before.
+
+    Raises:
+        UserError: One line with the new name.
+    """
+    for old, new in RENAMED.items():
+        if word_after(argv, f"--{old.replace('_', '-')}") is not None:
+            raise UserError(f"{old} is called {new} now: give --{new.replace('_', '-')}")
+    for name, renamed in RENAMED_VALUES.items():
+        for value in words_after(argv, f"--{name.replace('_', '-')}"):
+            if value in renamed:
+                raise UserError(f"{name} {value!r} is called {renamed[value]!r} now")
+
+
+def choices_of(setting: Setting) -> tuple[str, ...] | None:
+    """The names that a setting allows; a user's gates and predictors among them."""
+    if setting.name == "gate":
+        return registered_gates()
+    if setting.name == "predictor":
+        return registered_predictors()
+    return setting.about.choices
+
+
+def kind_of(setting: Setting) -> Any:
+    """The type that an option of a setting parses to."""
+    kind, choices = setting.kind, choices_of(setting)
+    if choices is None:
+        return kind
+    names = Literal[choices]  # pyright: ignore[reportInvalidTypeForm]
+    return Union[kind, names] if kind in (int, float) else names  # noqa: UP007
+
+
+def option_fields(settings: Mapping[str, Setting], *, everything: bool) -> dict[str, list[Any]]:
+    """For each group the fields of its dataclass: one option a setting, with its true value.
+
+    Args:
+        settings: By name.
+        everything: Whether help shows all of them, or the common ones alone.
+    """
+    groups: dict[str, list[Any]] = {group: [] for group in GROUPS}
+    for name, one in settings.items():
+        told = tyro.conf.arg(help=one.about.help)
+        kind: Any = Annotated[kind_of(one), told]
+        if not (one.about.common or everything):
+            kind = Annotated[kind_of(one), told, tyro.conf.Suppress]
+        groups[one.about.group].append((name, kind, dataclasses.field(default=one.value)))
+    return groups
+
+
+def axis_fields(settings: Mapping[str, Setting], *, everything: bool) -> list[Any]:
+    """Fields of a dataclass with several values of every setting that a sweep may vary."""
+    fields = []
+    for name, one in settings.items():
+        if name == "total_steps":
+            continue
+        listed = typing.get_origin(one.kind) is tuple
+        kind: Any = str if listed else kind_of(one)
+        text = one.about.help + (" Each value is W,W,...." if listed else "")
+        shown = ",".join(map(str, one.value)) if listed else one.value
+        told = tyro.conf.arg(help=f"{text} (a run's own: {shown})")
+        whole: Any = Annotated[tuple[kind, ...], told]
+        if not (one.about.common or everything):
+            whole = Annotated[tuple[kind, ...], told, tyro.conf.Suppress]
+        fields.append((name, whole, dataclasses.field(default=())))
+    return fields
+
+
+def axis_values(settings: Mapping[str, Setting], axes: Any) -> dict[str, tuple[Any, ...]]:
+    """The axes that were given values, by name.
+
+    Raises:
+        UserError: If a value of widths is no list of whole numbers.
+    """
+    found = {}
+    for name, values in vars(axes).items():
+        if not values:
+            continue
+        if typing.get_origin(settings[name].kind) is tuple:
+            values = tuple(_widths(name, value) for value in values)
+        found[name] = values
+    return found
+
+
+def _widths(name: str, text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.replace("x", ",").split(","))
+    except ValueError as error:
+        raise UserError(
+            f"{name} must be widths such as 64,64 for each value of a sweep, got {text!r}"
+        ) from error
+
+
+def parse_seeds(words: Iterable[str]) -> tuple[int, ...]:
+    """Seeds from `5` (0 to 4), `3 7 11` or `10-19`.
+
+    Raises:
+        UserError: If a word is neither, a seed is there twice, or there is none.
+    """
+    words = list(words)
+    seeds: list[int] = []
+    try:
+        if len(words) == 1 and "-" not in words[0][1:]:
+            count = int(words[0])
+            if count < 1:
+                raise UserError(f"seeds must be at least 1, got {count}")
+            return tuple(range(count))
+        for word in words:
+            first, dash, last = word.partition("-")
+            seeds += range(int(first), int(last) + 1) if dash else [int(word)]
+    except ValueError as error:
+        raise UserError(
+            f"seeds must be a number of them (5), a list (3 7 11) or a range (10-19), got "
+            f"{' '.join(words)!r}"
+        ) from error
+    if not seeds:
+        raise UserError(f"seeds must be at least one, got {' '.join(words)!r}")
+    if len(set(seeds)) != len(seeds):
+        raise UserError(f"seeds: every seed once, got {' '.join(words)}")
+    return tuple(seeds)
+
+
+def environments() -> str:
+    """The environments' names, for help."""
+    return ", ".join(registered())
