@@ -90,7 +90,10 @@ def parse(argv: Sequence[str]) -> Any:
     union: Any = kinds[0]
     for kind in kinds[1:]:
         union = union | kind
-    return finish(tyro.cli(union, prog="ppl", args=words, description=__doc__))
+    parsed = tyro.cli(union, prog="ppl", args=words, description=__doc__)
+    if isinstance(parsed, Play):
+        parsed.words = tuple(words)
+    return finish(parsed)
 
 
 def _seeds(parsed: Any) -> Any:
@@ -330,13 +333,10 @@ def _render(command: Render) -> None:
 def _play(command: Play) -> None:
     from experiments.engine.runtime import start_jax
     from experiments.engine.settings import run_settings
+    from experiments.ui.options import named_options
     from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 
-    given = {
-        name: value
-        for name, value in vars(command).items()
-        if value is not None and name not in ("out", "resume", "host", "port", "expose")
-    }
+    given = named_options(command, command.words)
     if command.consent is not None:
         given["consent"] = read_consent(command.consent)
     if command.questions is not None:
@@ -349,18 +349,17 @@ def _play(command: Play) -> None:
     else:
         if command.env is None:
             raise UserError("env: name the environment, such as driving")
-        method, seed = command.algorithm or "ppl", command.seed or 0
         names = ("total_steps", "preference_horizon", "beta", "learning_rate")
         settings = run_settings(
             command.env,
-            method,
-            seed,
+            command.algorithm,
+            command.seed,
             expert="person",
             scenarios=command.scenarios,
             given={name: given[name] for name in names if name in given},
         )
         session_config = new_session(command.env, given)
-        out = command.out or new_folder(command.env, method, seed)
+        out = command.out or new_folder(command.env, command.algorithm, command.seed)
     start_jax()
     play(
         settings,

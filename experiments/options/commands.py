@@ -386,11 +386,11 @@ class Play:
     """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
 
     env: Positional[str | None] = None
-    """Environment: driving, table_wiping or nut_assembly; with --resume that of the folder."""
-    algorithm: str | None = None
-    """Method that learns from you: ppl (default), pvp, hg_dagger, iwr, eil or haco."""
-    seed: int | None = None
-    """Random seed (default: 0)."""
+    """Environment (`ppl list` names them); with --resume that of the folder."""
+    algorithm: str = "ppl"
+    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
+    seed: int = 0
+    """Random seed."""
     total_steps: int | None = None
     """Steps of the session."""
     preference_horizon: int | Literal["auto"] | None = None
@@ -399,14 +399,14 @@ class Play:
     """Temperature of the preference loss."""
     learning_rate: float | None = None
     """Of Adam."""
-    manual_episodes: int | None = None
-    """Number of episodes at the start in which you make every step (default: 0)."""
-    participant: str | None = None
+    manual_episodes: int = 0
+    """Number of episodes at the start in which you make every step."""
+    participant: str = ""
     """Your name in a study: at most 32 letters, digits, - and _."""
     consent: Path | None = None
     """Text file to agree to before anything starts."""
-    familiarisation: int | None = None
-    """Successes in a row, driving alone, before steps count (default: 0; the paper: 10)."""
+    familiarisation: int = 0
+    """Successes in a row, driving alone, before steps count (the paper: 10)."""
     questions: Path | None = None
     """JSON file of questions asked after every episode."""
     rate: float | None = None
@@ -419,12 +419,13 @@ class Play:
     """Port to listen on; 0 takes a free one."""
     expose: bool = False
     """Allow a host that others on the network can reach."""
-    evaluate: bool | None = None
-    """Play the held-out scenarios at the end (default: yes)."""
+    evaluate: bool = True
+    """Play the held-out scenarios at the end."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
     """Continue the session in --out; its settings come from there."""
+    words: Suppress[tuple[str, ...]] = ()
 
 
 @dataclasses.dataclass

@@ -16,48 +16,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.registry import registered
 from experiments.engine.runtime import UserError, need
+from ppl_jax.cards import EnvCard, card
 from ppl_jax.types import Env
 
 PICTURE = (480, 640)  # height and width
 
 
-class Display(NamedTuple):
-    """How an environment is shown.
-
-    Attributes:
-        drawing: "road" or "arm".
-        control_rate: Steps per second.
-    """
-
-    drawing: str
-    control_rate: float
+_NEEDS = {"arm": (("mujoco", "manipulation"), ("PIL", "ui"))}  # view -> (module, extra)
 
 
-# the only place that names environments here; their cards (envs/cards.py) are to say it instead
-_DISPLAYS = {
-    "driving": Display(drawing="road", control_rate=10.0),
-    "table_wiping": Display(drawing="arm", control_rate=20.0),
-    "nut_assembly": Display(drawing="arm", control_rate=20.0),
-}
-_NEEDS = {"arm": (("mujoco", "manipulation"), ("PIL", "ui"))}  # drawing -> (module, extra)
-
-
-def display_of(env_name: str) -> Display:
-    """How an environment is shown; checked without building it.
+def display_of(env_name: str) -> EnvCard:
+    """The card of an environment that can be shown; checked without building it.
 
     Raises:
         UserError: If it has no drawing, or a package for it is missing.
     """
-    display = _DISPLAYS.get(env_name)
-    if display is None or display.drawing not in VIEWS:
+    found = card(env_name)
+    if found.view is None:
+        drawn = ", ".join(name for name in registered() if card(name).view is not None)
         raise UserError(
             f"env: {env_name} has no drawing, so that it cannot be shown in a browser; those with "
-            f"one are {', '.join(_DISPLAYS)}"
+            f"one are {drawn}"
         )
-    for module, extra in _NEEDS.get(display.drawing, ()):
+    for module, extra in _NEEDS.get(found.view, ()):
         need(module, extra, f"showing {env_name}")
-    return display
+    return found
 
 
 class Shown(NamedTuple):
@@ -120,7 +105,7 @@ def make_view(env: Env, picture: Picture) -> View:
     Raises:
         UserError: If it has none.
     """
-    return VIEWS[display_of(env.name).drawing](env, picture)
+    return VIEWS[display_of(env.name).view or ""](env, picture)
 
 
 def _rounded(values: Any, digits: int = 2) -> list[Any]:

@@ -5,6 +5,7 @@ import json
 import sys
 import threading
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +22,10 @@ from experiments.engine.recorded import length_of, recorded_functions
 from experiments.engine.run import RunSettings, open_folder, train
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
+from experiments.options.commands import Play
 from experiments.ui import views
 from experiments.ui.config import Question, SessionConfig
+from experiments.ui.options import named_options
 from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 from experiments.ui.protocol import (
     BURST,
@@ -604,6 +607,15 @@ def test_a_session_resumes_with_the_settings_of_its_folder(tmp_path):
         f"cannot resume {str(tmp_path)!r}: its participant is 'p1', asked for 'p2'; its seed is 0, "
         "asked for 3"
     )
+
+
+def test_only_options_that_are_named_are_compared():
+    command = Play(env=None, participant="p1", seed=0, evaluate=False, out=Path("run"), port=0)
+    assert named_options(command, ["play", "--resume", "--out", "run"]) == {}
+    words = ["play", "--participant=p1", "--seed", "0", "--no-evaluate", "--port", "0"]
+    expected = {"participant": "p1", "seed": 0, "evaluate": False}
+    assert named_options(command, words) == expected
+    assert named_options(Play(env="driving"), ["play", "driving"]) == {"env": "driving"}
 
 
 def test_sessions_of_older_versions_resume(tmp_path):
