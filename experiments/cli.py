@@ -115,7 +115,7 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     words = list(argv)
     if "--algorithms" not in argv and study is not None:
         words += ["--algorithms", *STUDIES[study].algorithms]
-    settings = settings_in(words)
+    settings = settings_in(words, sweeping=True)
     axes = dataclasses.make_dataclass("axes", axis_fields(settings, everything=HELP_ALL in argv))
     member = ("axes", tyro.conf.OmitArgPrefixes[axes], dataclasses.field(default_factory=axes))
     made = dataclasses.make_dataclass(cls.__name__, [member], bases=(cls,))

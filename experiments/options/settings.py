@@ -22,9 +22,14 @@ HELP_ALL = "--help-all"
 
 
 def word_after(argv: Sequence[str], option: str) -> str | None:
-    """The value of `--option value` or `--option=value` in a command line."""
-    found = words_after(argv, option)
-    return found[-1] if found else None
+    """The last value of `--option value` or `--option=value` in a command line."""
+    found = None
+    for word, following in zip(argv, [*argv[1:], "--"], strict=True):
+        name, has_value, value = word.partition("=")
+        if word.startswith("--") and name.replace("_", "-") == option:
+            value = value if has_value else following
+            found = found if value.startswith("--") else value
+    return found
 
 
 def words_after(argv: Sequence[str], option: str) -> list[str]:
@@ -47,17 +52,24 @@ def environments_in(argv: Sequence[str]) -> list[str]:
     return [word for word in argv if not word.startswith("-") and known(word)]
 
 
-def settings_in(argv: Sequence[str], preset: str = "default") -> dict[str, Setting]:
+def settings_in(argv: Sequence[str], *, sweeping: bool = False) -> dict[str, Setting]:
     """The settings of the runs that a command line asks for, with the values they would have.
+
+    Args:
+        argv: The words after the command.
+        sweeping: Methods, gates and predictors may be several.
 
     Raises:
         UserError: If a method, gate, predictor or preset is unknown, or an old name is used.
     """
     refuse_old_names(argv)
     env = (environments_in(argv) or ["driving"])[0]
+    preset = word_after(argv, "--preset") or "default"
     methods = words_after(argv, "--algorithms") or [word_after(argv, "--algorithm") or "ppl"]
-    preset = word_after(argv, "--preset") or preset
-    several = {name: words_after(argv, f"--{name}") or [None] for name in ("gate", "predictor")}
+    several: dict[str, Sequence[str | None]] = {}
+    for name in ("gate", "predictor"):
+        one = [word_after(argv, f"--{name}")]
+        several[name] = (words_after(argv, f"--{name}") or [None]) if sweeping else one
     found: dict[str, Setting] = {}
     try:
         for method in methods:

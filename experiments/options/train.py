@@ -80,7 +80,9 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     if before is not None:
         own |= {name: getattr(before, name) for name in own if hasattr(before, name)}
         held = flat(before.config, before.hparams)
-        settings = settings_in([before.env, "--algorithm", before.algorithm, *argv])
+        settings = settings_in(
+            [before.env, *argv, "--algorithm", before.algorithm, *_gate_and_predictor(held)]
+        )
         settings = {
             name: one._replace(value=_like(held[name], one.value)) if name in held else one
             for name, one in settings.items()
@@ -108,6 +110,11 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     made = dataclasses.make_dataclass("Train", members)
     made.__doc__ = "Train one policy: progress, then the evaluation table; a run folder."
     return made, defaults
+
+
+def _gate_and_predictor(held: Mapping[str, Any]) -> list[str]:
+    """The options that name a run's gate and predictor."""
+    return ["--gate", held["gate"], "--predictor", held["predictor"]]
 
 
 def _tenth(settings: Mapping[str, Setting]) -> int:
