@@ -164,7 +164,7 @@ def test_a_single_run_has_intervals_over_scenarios(schema, tmp_path, capsys):
     config |= {"config": {}, "hparams": {}} if schema == 1 else {"schema": 2, "settings": {}}
     (tmp_path / "config.json").write_text(json.dumps(config))
     (tmp_path / "policy.npz").touch()  # not a folder of experts
-    with pytest.raises(UserError, match="has no evaluation.csv yet"):
+    with pytest.raises(UserError, match=r"has no evaluation\.csv yet"):
         report.read_points(tmp_path)
     rows = episode_rows([7], ("ppl",))
     names = [name for name in rows[0] if name not in ("algorithm", "seed", "training_cost")]
@@ -286,9 +286,9 @@ def test_heat_maps_of_shares_run_from_0_to_1(tmp_path, monkeypatch):
 
 def test_unknown_columns_and_kinds_are_refused(tmp_path):
     path = results(tmp_path / "results.csv", betas=(0.1,))
-    with pytest.raises(UserError, match="column must be one of .* did you mean 'success'"):
+    with pytest.raises(UserError, match=r"column must be one of .* did you mean 'success'"):
         report.read_points(path)[0].interval("sucess")
-    with pytest.raises(UserError, match="kind must be one of .* did you mean 'heatmap'"):
+    with pytest.raises(UserError, match=r"kind must be one of .* did you mean 'heatmap'"):
         figures.figure(path, kind="heatmaps", out=tmp_path / "x.png")
 
 
