@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import subcommand
 
 from envs.compiler import set_xla_flags
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, hide_compiler_logs
 from experiments.engine.schedulers import SERVE
 from experiments.options.commands import (
     Ablation,
@@ -243,7 +243,7 @@ def _expert(command: Expert) -> None:
     else:
         from experiments.report.card import write_card
 
-        write_card(command.command.run, command.command.out)
+        write_card(command.command.run, command.command.out, force=command.command.force)
 
 
 def _expert_train(command: ExpertTrain) -> None:
@@ -324,46 +324,46 @@ def _render(command: Render) -> None:
 def _play(command: Play) -> None:
     from experiments.engine.runtime import start_jax
     from experiments.engine.settings import run_settings
-    from experiments.ui.play import play, read_consent, read_questions
-    from experiments.ui.session import SessionConfig
-    from experiments.ui.views import RATES
+    from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 
-    asked = {
+    given = {
         name: value
-        for name in ("total_steps", "preference_horizon", "beta", "learning_rate")
-        if (value := getattr(command, name)) is not None
+        for name, value in vars(command).items()
+        if value is not None and name not in ("out", "resume", "host", "port", "expose")
     }
-    settings = run_settings(
-        command.env,
-        command.algorithm,
-        command.seed,
-        expert="person",
-        scenarios=command.scenarios,
-        given=asked,
-    )
-    rate = command.rate or RATES.get(command.env, 10.0)
-    if not 0.1 <= rate <= 1000:
-        raise UserError(f"rate must lie between 0.1 and 1000, got {rate}")
-    if command.resume and command.out is None:
-        raise UserError("--resume needs --out, the run folder to go on with")
-    sitting = SessionConfig(
-        rate=rate,
-        participant=command.participant,
-        consent=None if command.consent is None else read_consent(command.consent),
-        familiarisation=command.familiarisation,
-        questions=() if command.questions is None else read_questions(command.questions),
-        evaluate=command.evaluate,
-    )
+    if command.consent is not None:
+        given["consent"] = read_consent(command.consent)
+    if command.questions is not None:
+        given["questions"] = read_questions(command.questions)
+    if command.resume:
+        if command.out is None:
+            raise UserError("--resume needs --out, the run folder to continue")
+        out = command.out
+        settings, session_config = resumed(out, given)
+    else:
+        if command.env is None:
+            raise UserError("env: name the environment, such as driving")
+        method, seed = command.algorithm or "ppl", command.seed or 0
+        names = ("total_steps", "preference_horizon", "beta", "learning_rate")
+        settings = run_settings(
+            command.env,
+            method,
+            seed,
+            expert="person",
+            scenarios=command.scenarios,
+            given={name: given[name] for name in names if name in given},
+        )
+        session_config = new_session(command.env, given)
+        out = command.out or new_folder(command.env, method, seed)
     start_jax()
     play(
         settings,
-        command.out or new_folder(command.env, command.algorithm, command.seed),
-        command.resume,
-        sitting,
-        command.manual_episodes,
-        command.host,
-        command.port,
-        command.expose,
+        out,
+        session_config,
+        resume=command.resume,
+        host=command.host,
+        port=command.port,
+        exposed=command.expose,
     )
 
 
@@ -437,6 +437,7 @@ _ACTIONS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
+    hide_compiler_logs()
     words = sys.argv[1:] if argv is None else argv
     if words == [SERVE]:
         from experiments.engine.worker import serve

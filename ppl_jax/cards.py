@@ -11,6 +11,8 @@ import importlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from ppl_jax.packages import own_packages
+
 Changes = Mapping[str, Any]
 
 
@@ -87,7 +89,7 @@ class EnvCard:
 
 
 DEFAULT = EnvCard()
-_SHIPPED = "envs"  # the package that registers the shipped environments
+_SHIPPED = "envs.registry"  # the package that registers the shipped environments
 _CARDS: dict[str, EnvCard] = {}
 
 
@@ -99,5 +101,6 @@ def register_card(name: str, card: EnvCard) -> None:
 def card(name: str) -> EnvCard:
     """The card of an environment; the default one where it has none of its own."""
     if name not in _CARDS:
+        own_packages()
         importlib.import_module(_SHIPPED)  # registers the shipped ones; imports no JAX
     return _CARDS.get(name, DEFAULT)

@@ -169,7 +169,7 @@ class Setting(NamedTuple):
 
 
 def _parts(config: TrainConfig, hparams: HParams) -> list[tuple[Any, tuple[str, ...], bool]]:
-    """Every settings object of a run, its fields that are such objects, and whether it is traced."""
+    """Every settings object of a run, its fields that are such objects, and if it is traced."""
     return [
         (config, OWNED_CONFIG, False),
         (config.method, (), False),
@@ -275,10 +275,13 @@ def preset_values(preset: str, env: str) -> dict[str, Any]:
 
     `default`: what works best here: the paper's horizons, beta, gate and pairs; the released code's
     bias. The paper's loss (bias 1) has no optimum inside the action box for a Gaussian policy and
-    overshoots (`ppl_jax.distributions`). `paper`: the paper's formula to the letter: H = 10, L = 4 (6 in
-    nut assembly), beta = 0.1, bias 1; it leaves network, batch, learning rate and likelihood open, and
-    the Laplace one is that under which its formula has an optimum. `reference`: the released code's
-    settings (metadriverse/PPL at 7a55c24), for driving alone.
+    overshoots (`ppl_jax.distributions`).
+
+    `paper`: the paper's formula to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias
+    1. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is that
+    under which its formula has an optimum.
+
+    `reference`: the released code's settings (metadriverse/PPL at 7a55c24), for driving alone.
 
     Args:
         preset: "default", "paper" or "reference".

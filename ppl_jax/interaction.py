@@ -74,8 +74,10 @@ class Steps(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the novice, not yet clipped.
-        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with its noise.
+        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the
+            novice, not yet clipped.
+        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with
+            its noise.
         interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step of
             whoever `learner.takeover` says, the expert's action being `action` where it is given.
             `started`: an expert in control was not in the step before.

@@ -1,7 +1,7 @@
-"""The training loop step by step, for somebody outside who decides: a person, or a recording.
+"""The training loop step by step, driven by an external controller: a person or a recording.
 
-Each step is the one that `ppl_jax.training` scans, with the same buffers and updates; only who acts
-is not decided by a gate.
+Each step is the one that `ppl_jax.training` scans, with the same buffers and updates; only the
+takeover is decided outside instead of by a gate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.interaction import Learner, make_steps, summarise
+from ppl_jax.interaction import Learner, Steps, make_steps, summarise
 from ppl_jax.losses import Metrics
 from ppl_jax.predictors import predict, predictor
 from ppl_jax.types import Env, Interaction, Trajectory
@@ -24,21 +24,21 @@ PyTree = Any
 
 
 class LiveFunctions(NamedTuple):
-    """What `make_live` returns; all pure and jittable.
+    """The functions that `make_live` builds; all pure and jittable.
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        predict_path: `predict_path(learner, action, mine) -> Trajectory` [H] with positions where the world
-            can tell them: of `action` held where `mine`, else of what the novice would do now.
-        play: `play(learner, takeover, action) -> (Learner, Interaction)`: one step, of `action` [A]
-            where `takeover`, else of the novice.
+        predict_path: `predict_path(learner, action, mine) -> Trajectory` [H], with positions if
+            `place` was given: `action` [A] held where `mine`, else the novice's action held.
+        play: `play(learner, takeover, action) -> (Learner, Interaction)`: one step, with `action`
+            [A] where `takeover`, else with the novice's.
         learn: `learn(learner) -> (Learner, Metrics)`: one update.
         fit: `fit(learner, updates) -> (Learner, Metrics)`: a static number of the updates that a
             method makes on demonstrations before its first step.
         restart: `restart(learner) -> Learner` at a new start, the episode left unfinished.
-        ingest: `ingest(learner, interactions [T], learning=True) -> (Learner, Metrics)`: take
+        ingest: `ingest(learner, interactions [T], learning=True) -> (Learner, Metrics)`: use
             recorded steps as if they were made now, with an update after each where `learning`.
-            The settings and key of the session that was recorded give its policy again.
+            With the settings and key of the recorded session, its policy results again.
         algorithm: The method.
     """
 
@@ -56,20 +56,21 @@ def make_live(
     env: Env,
     make_algorithm: MakeAlgorithm,
     config: TrainConfig,
+    *,
     place: Callable[[PyTree], jax.Array] | None = None,
     env_params: PyTree | None = None,
 ) -> LiveFunctions:
-    """Build the functions that train one policy with somebody outside in control.
+    """Build the functions that train one policy with an external controller.
 
     Args:
-        env: The world.
-        make_algorithm: `ppl_jax.algorithms.method(name).make`, or one's own.
+        env: The environment.
+        make_algorithm: `ppl_jax.algorithms.method(name).make`, or one of your own.
         config: Static settings; check them with `ppl_jax.config.validate` first.
         place: `place(state) -> position [P]`, for predicted paths.
-        env_params: The world's parameters; its training ones where None.
+        env_params: The environment's parameters; its training ones where None.
 
     Raises:
-        ValueError: If the world lacks the predictor that `config` names.
+        ValueError: If the environment lacks the predictor that `config` names.
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
@@ -104,6 +105,17 @@ def make_live(
         learner = dataclasses.replace(learner, takeover=takeover)
         return steps.interact(learner, started, jnp.clip(action, -1.0, 1.0))
 
+    functions = _learning(env, steps, algorithm, params)
+    return LiveFunctions(
+        init=steps.init, predict_path=predict_path, play=play, algorithm=algorithm, **functions
+    )
+
+
+def _learning(
+    env: Env, steps: Steps, algorithm: Algorithm, params: PyTree
+) -> dict[str, Callable[..., Any]]:
+    """The `LiveFunctions` that do not choose an action: learn, fit, restart and ingest."""
+
     def learn(learner: Learner) -> tuple[Learner, Metrics]:
         return steps.learn(learner, algorithm.update)
 
@@ -131,4 +143,4 @@ def make_live(
         learner, metrics = jax.lax.scan(step, learner, interactions)
         return learner, summarise(metrics, before, learner.counters)
 
-    return LiveFunctions(steps.init, predict_path, play, learn, fit, restart, ingest, algorithm)
+    return {"learn": learn, "fit": fit, "restart": restart, "ingest": ingest}

@@ -37,8 +37,8 @@ class RunHistory(NamedTuple):
     diverged: jax.Array
 
 
-RunFn = Callable[[jax.Array, HParams, PyTree], RunHistory]
-"""`lane(key, hparams, held_out_params) -> RunHistory`."""
+RunFn = Callable[[jax.Array, HParams, PyTree], Any]
+"""`run(key, hparams, held_out_params) -> RunHistory`."""
 
 
 def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
@@ -52,16 +52,24 @@ def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
     return steps if steps and steps[-1] == end else [*steps, end]
 
 
-def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: int) -> RunFn:
+def make_run(
+    env: Env,
+    functions: TrainFunctions,
+    config: TrainConfig,
+    every: int,
+    *,
+    keep_policy: bool = False,
+) -> RunFn:
     """One whole run as a function: `RunHistory` at `evaluation_steps(config, every)`.
 
     It trains what `ppl train` trains, number for number, but holds the evaluations in the
     program.
 
     Args:
-        env: The world; its held-out parameters are an argument of the lane, not a constant.
+        env: The world; its held-out parameters are an argument of the run, not a constant.
         functions: Of the method (`ppl_jax.training.make_train`).
         config: Static settings.
+        keep_policy: Return (RunHistory, the policy's layers at the end) instead.
         every: Steps between evaluations; a multiple of the decision interval and of the method's
             rounds.
     """
@@ -81,7 +89,7 @@ def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: in
         episodes = make_evaluate(env, act)(held_out, jax.random.key(0))
         return RunHistory(episodes, learner.counters, learner.diverged)
 
-    def lane(key: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
+    def run(key: jax.Array, hparams: HParams, held_out: PyTree) -> Any:
         learner, curves = functions.init(key, hparams), []
 
         def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, RunHistory]:
@@ -101,25 +109,28 @@ def make_run(env: Env, functions: TrainFunctions, config: TrainConfig, every: in
                 curves.append(one(last))
         if not curves:  # demonstrations that nothing is learnt from
             curves.append(one(look(learner, held_out)))
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *curves)
+        history = jax.tree.map(lambda *parts: jnp.concatenate(parts), *curves)
+        if keep_policy:
+            return history, functions.algorithm.policy(learner.algorithm)
+        return history
 
-    return lane
+    return run
 
 
 def make_batch(
-    lane: RunFn, side_by_side: bool
+    run: RunFn, side_by_side: bool
 ) -> Callable[[jax.Array, HParams, PyTree], RunHistory]:
     """`batch(keys [B], hparams [B], held_out_params) -> RunHistory` with a leading [B].
 
     Args:
-        lane: One run.
+        run: One run.
         side_by_side: Step the runs together (`vmap`), or one after another (`lax.map`).
     """
     if side_by_side:
-        return jax.vmap(lane, in_axes=(0, 0, None))
+        return jax.vmap(run, in_axes=(0, 0, None))
 
     def one_after_another(keys: jax.Array, hparams: HParams, held_out: PyTree) -> RunHistory:
-        return jax.lax.map(lambda run: lane(run[0], run[1], held_out), (keys, hparams))
+        return jax.lax.map(lambda one: run(one[0], one[1], held_out), (keys, hparams))
 
     return one_after_another
 

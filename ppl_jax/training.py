@@ -97,8 +97,8 @@ def make_train(
     if density is None:
         if algorithm.decide is None and gate(config.gate).needs_density:
             raise ValueError(
-                f"gate {config.gate!r} needs an expert with a density, such as a neural one: give one, "
-                "or another gate"
+                f"gate {config.gate!r} needs an expert with a density, such as a neural one: "
+                "give one, or another gate"
             )
         density = lambda observation, action: jnp.nan  # noqa: E731
 

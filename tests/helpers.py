@@ -320,7 +320,8 @@ def probe_settings(name, **changes):
         "survival_correction": 1.0,  # success ends the episode in these worlds
     }
     config, hparams = replace(config, hparams, **{k: v for k, v in faster.items() if k in known})
-    return replace(config, hparams, **changes)
+    others = {k for k in TINY if k not in known}  # what only other methods have
+    return replace(config, hparams, **{k: v for k, v in changes.items() if k not in others})
 
 
 def outcome(out):

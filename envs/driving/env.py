@@ -338,11 +338,6 @@ class Driving(Environment):
         )
         return self._finish(params, scenario, state, ego, traffic, solid=True)
 
-    @property
-    def predictors(self) -> dict[str, Any]:
-        """The world's own transition, and the bicycle that sees traffic frozen."""
-        return {"simulator": self.transition, "kinematic": self.transition_kinematic}
-
     def transition_kinematic(
         self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
     ) -> tuple[DrivingState, Outcome]:

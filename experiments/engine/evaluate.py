@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make, pretrained
+from envs import pretrained
+from envs.registry import make
 from experiments.engine.policy_file import load_meta, load_policy
 from experiments.engine.run_folder import EVALUATION, POLICY, RunFolder
 from experiments.engine.runtime import UserError

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs import known, unknown
+from envs.registry import known, unknown
 from experiments.engine.evaluate import (
     EvaluationRow,
     evaluate_policy,

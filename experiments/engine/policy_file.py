@@ -9,13 +9,13 @@ a policy that has one), `version` of this format, and `meta`, a JSON string.
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.engine.files import write_atomic
 from ppl_jax.experts import SavedPolicy
 
 VERSION = 1
@@ -28,19 +28,15 @@ def save_policy(path: str | Path, policy: SavedPolicy, meta: dict[str, Any]) -> 
         arrays[f"w{i}"], arrays[f"b{i}"] = np.asarray(w), np.asarray(b)
     if policy.log_std is not None:
         arrays["log_std"] = np.asarray(policy.log_std, np.float32)
-    part = Path(f"{path}.part")
-    with open(part, "wb") as file:
-        np.savez(
-            file,
-            **arrays,
-            activation=np.array(policy.activation),
-            output=np.array(policy.output),
-            obs_mean=np.asarray(policy.obs_mean, np.float32),
-            obs_scale=np.asarray(policy.obs_scale, np.float32),
-            version=np.array(VERSION),
-            meta=np.array(json.dumps(meta)),
-        )
-    os.replace(part, path)
+    arrays |= {
+        "activation": np.array(policy.activation),
+        "output": np.array(policy.output),
+        "obs_mean": np.asarray(policy.obs_mean, np.float32),
+        "obs_scale": np.asarray(policy.obs_scale, np.float32),
+        "version": np.array(VERSION),
+        "meta": np.array(json.dumps(meta)),
+    }
+    write_atomic(path, lambda file: np.savez(file, **arrays))
 
 
 def load_policy(path: str | Path, observation_size: int, action_size: int) -> SavedPolicy:

@@ -1,4 +1,4 @@
-"""Learning from a recorded session instead of an expert: its steps are taken as if made now."""
+"""Learning from a recorded session instead of an expert: its steps are used as if made now."""
 
 from __future__ import annotations
 
@@ -26,10 +26,14 @@ def recording_of(expert: str) -> Path | None:
 
 
 def length_of(path: Path, env: str) -> int:
-    """Steps of a recording of a world.
+    """Number of steps of a recording.
+
+    Args:
+        path: A run folder or an exported session.
+        env: Name of the environment that it has to be of.
 
     Raises:
-        UserError: If it cannot be read, or is of another world.
+        UserError: If it cannot be read, or is of another environment.
     """
     columns, config = recording.load(path)
     if config.get("env") != env:
@@ -40,7 +44,7 @@ def length_of(path: Path, env: str) -> int:
 def recorded_functions(
     env: Env, make_algorithm: MakeAlgorithm, config: TrainConfig, path: Path
 ) -> TrainFunctions:
-    """The training functions of `make_train`, with a recording for world and expert.
+    """The training functions of `make_train`, with a recording for environment and expert.
 
     `train` gives the metrics of its last phase as a whole, [1].
 
@@ -83,4 +87,4 @@ def recorded_functions(
             learner, metrics = run_chunk(learner, length // interval, phase)
         return learner, jax.tree.map(lambda leaf: leaf[None], metrics)
 
-    return TrainFunctions(live.init, run_chunk, train, algorithm)
+    return TrainFunctions(init=live.init, run_chunk=run_chunk, train=train, algorithm=algorithm)

@@ -1,23 +1,22 @@
-"""What a session was: every step with its state, as plain arrays, without pickles.
+"""Recordings of sessions: every step with its state, as plain arrays, without pickles.
 
-A run folder holds it in pieces (recording/NUMBER.npz, up to that line of the session's log); an
+A run folder holds one in pieces (recording/NUMBER.npz, up to that line of the session's log); an
 exported session is one file of the same columns. All are [T] or [T, ...]:
 
     observation, next_observation     before and after the step
-    novice_action, expert_action      what either would do (the person: where is_intervention)
-    executed_action, is_intervention  what was done, and whether the person did it
+    novice_action, expert_action      of either (the person's: where is_intervention)
+    executed_action, is_intervention  the action made, and whether the person made it
     takeover_start                    the person was not in control in the step before
     reward, cost, terminated, truncated, success
     predicted/...                     where the novice's held action would have led, [T, L, ...]
     episode                           a number for each, an unfinished one too
     ahead, fails                      the predicted path that was shown, [T, H, P], and its verdict
-    state/...                         the world before the step, enough to draw it
+    state/...                         the environment's before the step, enough to draw it
 """
 
 from __future__ import annotations
 
 import json
-import os
 import warnings
 import zipfile
 from pathlib import Path
@@ -26,14 +25,29 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from experiments.engine.files import write_atomic
 from experiments.engine.run_folder import RunFolder
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from ppl_jax.types import Env, Interaction, Trajectory
 
 FOLDER = "recording"
 STATE, PREDICTED, EPISODE, META = "state/", "predicted/", "episode", "meta"
 AHEAD, FAILS = "ahead", "fails"
 _RENAMED = {"takeover": "is_intervention"}
+_STEP_FIELDS = (
+    "observation",
+    "next_observation",
+    "novice_action",
+    "expert_action",
+    "executed_action",
+    "takeover_start",
+    "reward",
+    "cost",
+    "terminated",
+    "truncated",
+    "success",
+)
+_PREDICTED_FIELDS = ("observation", "reward", "speed", "unsafe", "success", "terminated", "valid")
 
 Columns = dict[str, np.ndarray]
 
@@ -56,8 +70,8 @@ def _flat(tree: Any) -> dict[str, Any]:
     return {"/".join(key.name for key in path): leaf for path, leaf in leaves}
 
 
-def row_of(step: Interaction, state: Any) -> dict[str, np.ndarray]:
-    """A step as a row of columns; `state` is the world before it."""
+def row_of(step: Interaction, state: Any) -> dict[str, Any]:
+    """A step as a row of columns; `state` is the environment's before it."""
     row = {_RENAMED.get(name, name): np.asarray(leaf) for name, leaf in _flat(step).items()}
     return row | {STATE + name: np.array(leaf) for name, leaf in _flat(state).items()}
 
@@ -68,10 +82,10 @@ class Recorder:
     def __init__(self, run: Path):
         self.folder = run / FOLDER
         self.episode = 0
-        self.rows: list[dict[str, np.ndarray]] = []
+        self.rows: list[dict[str, Any]] = []
 
     def add(self, step: Interaction, state: Any, ahead: PredictedPath) -> None:
-        """Take a step, the world before it and what was shown."""
+        """Take a step, the state before it and the predicted path that was shown."""
         row = row_of(step, state) | {AHEAD: ahead.path, FAILS: np.bool_(ahead.fails)}
         self.rows.append(row | {EPISODE: np.int32(self.episode)})
         self.episode += bool(row["terminated"] | row["truncated"])
@@ -80,13 +94,13 @@ class Recorder:
         """The episode was left unfinished."""
         self.episode += 1
 
-    def take(self) -> list[dict[str, np.ndarray]]:
-        """The steps so far, which are then the caller's to write."""
+    def take(self) -> list[dict[str, Any]]:
+        """Hand the steps so far over to the caller, which writes them."""
         rows, self.rows = self.rows, []
         return rows
 
-    def write(self, rows: list[dict[str, np.ndarray]], events: int) -> None:
-        """Write a piece: the steps up to so many lines of the log."""
+    def write(self, rows: list[dict[str, Any]], events: int) -> None:
+        """Write a piece: the steps up to line `events` of the log."""
         if not rows:
             return
         self.folder.mkdir(exist_ok=True)
@@ -94,7 +108,7 @@ class Recorder:
         _write(self.folder / f"{events:010d}.npz", columns | {"next_episode": self.episode})
 
     def rewind(self, events: int) -> None:
-        """Drop the pieces beyond so many lines of the log: those steps are made again."""
+        """Drop the pieces beyond line `events` of the log: those steps are repeated."""
         self.rows, self.episode = [], 0
         for path in _pieces(self.folder):
             if int(path.stem) > events:
@@ -109,14 +123,11 @@ def _pieces(folder: Path) -> list[Path]:
 
 
 def _write(path: Path, columns: dict[str, Any]) -> None:
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        np.savez_compressed(file, **columns)
-    os.replace(part, path)
+    write_atomic(path, lambda file: np.savez_compressed(file, **columns))
 
 
 def load(path: Path) -> tuple[Columns, dict[str, Any]]:
-    """The columns of a run folder or an exported session, and what its config.json says.
+    """The columns of a run folder or an exported session, and the content of its config.json.
 
     Raises:
         UserError: If there is no recording, or it cannot be read.
@@ -164,16 +175,39 @@ def export(run: Path, out: Path) -> int:
 
 
 def interactions(columns: Columns, env: Env, horizon: int) -> Interaction:
-    """Recorded steps as a method takes them, [T].
+    """Recorded steps as passed to a method, [T].
 
     Args:
-        columns: Of `load`.
-        env: The world they are learnt in.
-        horizon: Predicted states a method needs of each step (`max_preference_horizon`).
+        columns: From `load`.
+        env: The environment they are learnt in.
+        horizon: Predicted states that the method needs per step (`max_preference_horizon`).
 
     Raises:
-        UserError: If they are of another world, or hold fewer predicted states.
+        UserError: If they are of another environment, or hold fewer predicted states.
     """
+    _check_columns(columns, env)
+    kept = columns.get(PREDICTED + "observation")
+    have = 0 if kept is None else kept.shape[1]
+    if have < horizon:
+        raise UserError(
+            f"max_preference_horizon must not exceed the recording's predicted states ({have}), "
+            f"got {horizon}"
+        )
+
+    def column(name: str) -> Any:
+        if name not in columns:
+            raise UserError(f"the recording has no column {name!r}")
+        return columns[name]
+
+    predicted = {name: column(PREDICTED + name)[:, :horizon] for name in _PREDICTED_FIELDS}
+    return Interaction(
+        takeover=column("is_intervention"),
+        predicted=Trajectory(**predicted),
+        **{name: column(name) for name in _STEP_FIELDS},
+    )
+
+
+def _check_columns(columns: Columns, env: Env) -> None:
     for name, size in (
         ("observation", env.spec.observation_size),
         ("executed_action", env.spec.action_size),
@@ -188,69 +222,55 @@ def interactions(columns: Columns, env: Env, horizon: int) -> Interaction:
             bad = ~np.isfinite(column)
             if bad.any():
                 raise UserError(f"the recording's {name} is not finite in {bad.sum()} places")
-    kept = columns.get(PREDICTED + "observation")
-    have = 0 if kept is None else kept.shape[1]
-    if have < horizon:
-        raise UserError(
-            f"max_preference_horizon must not exceed the recording's predicted states ({have}), "
-            f"got {horizon}"
-        )
-
-    def column(name: str) -> np.ndarray:
-        if name not in columns:
-            raise UserError(f"the recording has no column {name!r}")
-        return columns[name]
-
-    fields = (
-        "observation",
-        "next_observation",
-        "novice_action",
-        "expert_action",
-        "executed_action",
-        "takeover_start",
-        "reward",
-        "cost",
-        "terminated",
-        "truncated",
-        "success",
-    )
-    seen = ("observation", "reward", "speed", "unsafe", "success", "terminated", "valid")
-    predicted = Trajectory(**{name: column(PREDICTED + name)[:, :horizon] for name in seen})
-    steps = {name: column(name) for name in fields}
-    return Interaction(takeover=column("is_intervention"), predicted=predicted, **steps)
 
 
 def states(columns: Columns, like: Any) -> Any:
-    """The recorded worlds, [T], as a struct like `like`.
+    """The recorded states, [T], as a struct like `like`.
 
     Raises:
-        UserError: If they are of another world.
+        UserError: If they are of another environment.
     """
     names = list(_flat(like))
     missing = [name for name in names if STATE + name not in columns]
     if missing:
-        raise UserError(f"the recording's states are of another world: they lack {missing[0]!r}")
+        raise UserError(
+            f"the recording's states are of another environment: they lack {missing[0]!r}"
+        )
     return jax.tree.unflatten(jax.tree.structure(like), [columns[STATE + name] for name in names])
 
 
 def export_minari(run: Path, name: str) -> int:
     """Write a session as a Minari data set; returns the number of its steps.
 
-    What was executed are its actions; `is_intervention` and both sides' actions are in its infos.
+    Its actions are the executed ones; `is_intervention` and both sides' actions are in its infos.
 
     Raises:
-        UserError: If Minari is not installed, has a data set of that name, or there is nothing.
+        UserError: If Minari is not installed, has a data set of that name, or no step was recorded.
     """
-    try:
-        import gymnasium
-        import minari
-        from minari.data_collector import EpisodeBuffer
-    except ImportError as error:
-        raise UserError(
-            f"a Minari data set needs the package {error.name}: pip install 'ppl-jax[minari]'"
-        ) from error
+    minari = need("minari", "minari", "a Minari data set")
+    spaces = need("gymnasium.spaces", "minari", "a Minari data set")
     columns, config = load(run)
     size, actions = columns["observation"].shape[1], columns["executed_action"].shape[1]
+    found = _episode_buffers(columns)
+    try:
+        # it warns that neither author nor link to code is named: both are the user's to add
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            minari.create_dataset_from_buffers(
+                name,
+                found,
+                observation_space=spaces.Box(-np.inf, np.inf, (size,), np.float32),
+                action_space=spaces.Box(-1.0, 1.0, (actions,), np.float32),
+                algorithm_name=str(config.get("algorithm")),
+                description=f"a person at the gate of {config.get('env')} (ppl_jax)",
+            )
+    except ValueError as error:
+        raise UserError(f"minari: {error}") from error
+    return len(columns[EPISODE])
+
+
+def _episode_buffers(columns: Columns) -> list[Any]:
+    """The recorded episodes as Minari takes them."""
+    buffer = need("minari.data_collector", "minari", "a Minari data set").EpisodeBuffer
     found = []
     for number in np.unique(columns[EPISODE]):
         at = columns[EPISODE] == number
@@ -263,7 +283,7 @@ def export_minari(run: Path, name: str) -> int:
         }
         last = columns["next_observation"][at][-1:]
         found.append(
-            EpisodeBuffer(
+            buffer(
                 observations=np.concatenate([columns["observation"][at], last]),
                 actions=columns["executed_action"][at],
                 rewards=columns["reward"][at],
@@ -272,17 +292,4 @@ def export_minari(run: Path, name: str) -> int:
                 infos={key: np.concatenate([v, v[-1:]]) for key, v in infos.items()},
             )
         )
-    try:
-        # it warns that neither author nor link to code is named: both are the user's to add
-        with warnings.catch_warnings(action="ignore", category=UserWarning):
-            minari.create_dataset_from_buffers(
-                name,
-                found,
-                observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32),
-                action_space=gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32),
-                algorithm_name=str(config.get("algorithm")),
-                description=f"a person at the gate of {config.get('env')} (ppl_jax)",
-            )
-    except ValueError as error:
-        raise UserError(f"minari: {error}") from error
-    return len(columns[EPISODE])
+    return found

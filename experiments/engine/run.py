@@ -28,11 +28,11 @@ from experiments.engine.progress import Progress
 from experiments.engine.recorded import recorded_functions, recording_of
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError, device, revision, versions
-from experiments.engine.settings import RunSettings, check
+from experiments.engine.settings import RunSettings, check, one_level
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import TrainConfig
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.interaction import Learner
+from ppl_jax.interaction import Counters, Learner
 from ppl_jax.networks import Layers
 from ppl_jax.training import Phase, TrainFunctions, make_train, phases
 from ppl_jax.types import Env, Expert
@@ -118,8 +118,8 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
         if done >= plan[-1].end:
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
-    runner = _Runner(settings, folder, env, functions)
     with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
+        runner = _Runner(settings, folder, env, functions, progress)
         waiting = [chunk for chunk in plan if chunk.end > done]
         runner.compile(learner, waiting[-1])
         progress.start()
@@ -201,12 +201,14 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
             before = folder.config()
         except ValueError as error:
             raise UserError(str(error)) from error
-        for name, value in content.items():
-            if before.get(name) != json.loads(json.dumps(value)):
-                raise UserError(
-                    f"cannot resume {str(folder.path)!r}: its {name} is {before.get(name)!r}, "
-                    f"asked for {value!r}"
-                )
+        held, asked = one_level(before), one_level(json.loads(json.dumps(content)))
+        differing = [
+            f"{name} is {held.get(name)!r}, asked for {value!r}"
+            for name, value in asked.items()
+            if name != "schema" and held.get(name) != value
+        ]
+        if differing:
+            raise UserError(f"cannot resume {str(folder.path)!r}: its {'; its '.join(differing)}")
         return
     try:
         folder.create(
@@ -221,8 +223,53 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
         raise UserError(str(error)) from error
 
 
+_OLD_HPARAMS = (  # of a learner's checkpoint before config.json had a schema
+    "preference_horizon",
+    "beta",
+    "bc_weight",
+    "preference_weight",
+    "preference_bias",
+    "prediction_noise",
+    "expert_noise",
+    "learning_rate",
+    "min_speed",
+    "min_return",
+    "max_departure",
+    "min_log_density",
+    "discount",
+    "target_rate",
+    "margin",
+    "conservative_weight",
+    "max_doubt",
+    "max_discrepancy",
+    "switch_rate",
+    "discriminator_rate",
+    "survival_correction",
+)
+_OLD_COUNTERS = {"physics_diverged": "broken"}
+
+
 def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
-    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none."""
+    """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none.
+
+    A checkpoint from before config.json had a schema holds settings and counters under other names.
+    """
+    if "hparams" in folder.config() and hasattr(learner, "counters"):
+        names = {f.name: _OLD_COUNTERS.get(f.name, f.name) for f in dataclasses.fields(Counters)}
+        old = dataclasses.replace(
+            learner,
+            hparams={name: jax.numpy.zeros((), jax.numpy.float32) for name in _OLD_HPARAMS},
+            counters={before: getattr(learner.counters, name) for name, before in names.items()},
+        )
+        done, found = _restore(folder, old)
+        if found is old:
+            return 0, learner
+        counters = Counters(**{name: found.counters[before] for name, before in names.items()})
+        return done, dataclasses.replace(found, hparams=learner.hparams, counters=counters)
+    return _restore(folder, learner)
+
+
+def _restore(folder: RunFolder, learner: Any) -> tuple[int, Any]:
 
     def warn(line: str) -> None:
         print(f"warning: {line}", file=sys.stderr)
@@ -237,9 +284,15 @@ class _Runner:
     """Compiled functions of a run and what happens between its chunks."""
 
     def __init__(
-        self, settings: RunSettings, folder: RunFolder, env: Env, functions: TrainFunctions
+        self,
+        settings: RunSettings,
+        folder: RunFolder,
+        env: Env,
+        functions: TrainFunctions,
+        progress: Progress,
     ):
         self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
+        self.progress = progress
         self.compile_s = self.train_s = 0.0
         self.trained_steps = 0
         self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
@@ -254,7 +307,9 @@ class _Runner:
 
             began = time.perf_counter()
             jitted = jax.jit(run, donate_argnums=0)
-            self.programs[kind] = jitted.lower(learner).compile()
+            what = f"{self.settings.algorithm} in {self.settings.env}, {chunk.phase}"
+            with self.progress.compiling(what, f"{what}, {chunk.length} steps"):
+                self.programs[kind] = jitted.lower(learner).compile()
             self.compile_s += time.perf_counter() - began
         return self.programs[kind]
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from pathlib import Path
 from typing import Any
+
+from experiments.engine.files import write_text_atomic
 
 CONFIG, METRICS, EVALUATION, SUMMARY, CHECKPOINTS, POLICY = (
     "config.json",
@@ -59,9 +60,7 @@ class RunFolder:
 
     def write_json(self, name: str, content: Any) -> None:
         """Replace a JSON file in one step."""
-        part = self.path / f"{name}.part"
-        part.write_text(json.dumps(content, indent=2) + "\n")
-        os.replace(part, self.path / name)
+        write_text_atomic(self.path / name, json.dumps(content, indent=2) + "\n")
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file of the folder."""
@@ -99,7 +98,7 @@ class RunFolder:
                     continue
                 if row["done"] <= done:
                     kept.append(line + "\n")
-            _replace(metrics, "".join(kept))
+            write_text_atomic(metrics, "".join(kept))
         evaluation = self.path / EVALUATION
         if evaluation.exists():
             lines = evaluation.read_text().splitlines(keepends=True)
@@ -110,10 +109,4 @@ class RunFolder:
                 cells = line.strip().split(",")
                 if len(cells) == len(columns) and int(cells[columns.index("step")]) <= step:
                     kept.append(line)
-            _replace(evaluation, "".join(kept))
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    os.replace(part, path)
+            write_text_atomic(evaluation, "".join(kept))

@@ -13,6 +13,7 @@ from typing import Any
 from envs.compiler import set_xla_flags
 
 CACHE_VARIABLE = "PPL_JAX_CACHE"
+LOG_VARIABLE = "TF_CPP_MIN_LOG_LEVEL"
 _PACKAGES = ("ppl-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -32,6 +33,15 @@ def need(module: str, extra: str, what: str) -> Any:
         raise UserError(f"{what} needs {module}: pip install 'ppl-jax[{extra}]'") from error
 
 
+def hide_compiler_logs() -> None:
+    """Keep XLA's own log, its slow-compile alarms among them, off the terminal.
+
+    JAX's exceptions and Python's warnings are not affected. Call before JAX is imported; processes
+    started later inherit it. A `TF_CPP_MIN_LOG_LEVEL` that the user set is kept: 0 shows all.
+    """
+    os.environ.setdefault(LOG_VARIABLE, "3")  # the alarms are logged as errors, which is level 2
+
+
 def cache_folder() -> Path:
     """Where compiled programs are kept: `PPL_JAX_CACHE`, or the user's cache folder."""
     named = os.environ.get(CACHE_VARIABLE)
@@ -42,8 +52,9 @@ def cache_folder() -> Path:
 
 
 def start_jax() -> None:
-    """Set compiler flags and turn the persistent compilation cache on. Call before JAX is used."""
+    """Set compiler flags, hide XLA's log, turn the compilation cache on. Call before using JAX."""
     set_xla_flags()
+    hide_compiler_logs()
     import jax
 
     folder = cache_folder()

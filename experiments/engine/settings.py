@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from envs import known, unknown
+from envs.registry import known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values
@@ -121,10 +121,23 @@ def with_values(algorithm: str, given: Mapping[str, Any]) -> tuple[TrainConfig, 
     return replace(config, hparams, **given)
 
 
+def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's config.json, of any version, as one level of names."""
+    of_a_method = content.get("algorithm") in algorithms.registered()
+    if of_a_method and content.get("schema", 1) == 1:
+        found = {**content, "settings": _of_schema_1(content)}
+        content = {k: v for k, v in found.items() if k not in ("config", "hparams")}
+    flat_content: dict[str, Any] = {}
+    for name, value in content.items():
+        nested = isinstance(value, dict) and name in ("settings", "config", "hparams")
+        flat_content |= value if nested else {name: value}
+    return flat_content
+
+
 def _of_schema_1(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings in a config.json of the first version, under today's names.
 
-    It held the settings of all methods and gates; those that the run's own do not have are left out.
+    It held the settings of all methods and gates; those that are not this run's are left out.
     """
     old = {**content["config"], **content["hparams"]}
     found = {RENAMED.get(name, name): value for name, value in old.items()}

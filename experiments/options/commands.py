@@ -220,8 +220,10 @@ class ExpertCard:
 
     run: Positional[Path]
     """Run folder of `ppl expert train`."""
-    out: Path = Path("envs/pretrained")
-    """Folder to write to."""
+    out: Path = Path("expert_card")
+    """Folder to write to; never the package's own `envs/pretrained`."""
+    force: bool = False
+    """Replace the files of an earlier card in --out."""
 
 
 @dataclasses.dataclass
@@ -233,9 +235,7 @@ class Sweep:
 
     envs: Positional[tuple[str, ...]]
     """Worlds: driving, table_wiping, nut_assembly."""
-    study: (
-        Literal["horizon", "horizon_beta", "prediction_noise", "expert_noise", "predictor"] | None
-    ) = None
+    study: str | None = None
     """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
     Values given replace the study's."""
     algorithms: tuple[str, ...] = ()
@@ -385,12 +385,12 @@ class Render:
 class Play:
     """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
 
-    env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
-    algorithm: str = "ppl"
-    """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
-    seed: int = 0
-    """Random seed."""
+    env: Positional[str | None] = None
+    """Environment: driving, table_wiping or nut_assembly; with --resume that of the folder."""
+    algorithm: str | None = None
+    """Method that learns from you: ppl (default), pvp, hg_dagger, iwr, eil or haco."""
+    seed: int | None = None
+    """Random seed (default: 0)."""
     total_steps: int | None = None
     """Steps of the session."""
     preference_horizon: int | Literal["auto"] | None = None
@@ -399,18 +399,18 @@ class Play:
     """Temperature of the preference loss."""
     learning_rate: float | None = None
     """Of Adam."""
-    manual_episodes: int = 0
-    """So many episodes at the start are all yours."""
-    participant: str = ""
-    """Who you are in a study: at most 32 letters, digits, - and _."""
+    manual_episodes: int | None = None
+    """Number of episodes at the start in which you make every step (default: 0)."""
+    participant: str | None = None
+    """Your name in a study: at most 32 letters, digits, - and _."""
     consent: Path | None = None
     """Text file to agree to before anything starts."""
-    familiarisation: int = 0
-    """Successes in a row, driving alone, before it counts (the paper: 10)."""
+    familiarisation: int | None = None
+    """Successes in a row, driving alone, before steps count (default: 0; the paper: 10)."""
     questions: Path | None = None
     """JSON file of questions asked after every episode."""
     rate: float | None = None
-    """Steps per second (default: the world's own, 10 in driving and 20 for the arm)."""
+    """Steps per second (default: the environment's own, 10 in driving and 20 for the arm)."""
     scenarios: str | None = None
     """Folder of recorded scenarios to train on."""
     host: str = "127.0.0.1"
@@ -419,12 +419,12 @@ class Play:
     """Port to listen on; 0 takes a free one."""
     expose: bool = False
     """Allow a host that others on the network can reach."""
-    evaluate: bool = True
-    """Play the held-out scenarios at the end."""
+    evaluate: bool | None = None
+    """Play the held-out scenarios at the end (default: yes)."""
     out: Path | None = None
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
-    """Go on with the session in --out."""
+    """Continue the session in --out; its settings come from there."""
 
 
 @dataclasses.dataclass

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from envs import known, registered
+from envs.registry import known, registered
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RENAMED, RENAMED_VALUES
 from ppl_jax import algorithms

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,7 +26,7 @@ from experiments.options.settings import (
     settings_in,
     word_after,
 )
-from ppl_jax.config import PRESETS
+from ppl_jax.config import PRESETS, Setting, TrainConfig
 
 _EXPERT = "scripted, neural (shipped), a policy file or run folder; or recorded PATH, a session."
 _OWN: dict[str, list[Any]] = {
@@ -47,8 +47,8 @@ _OWN: dict[str, list[Any]] = {
     "evaluation": [
         (
             "evaluate_every",
-            int | None,
-            None,
+            int,
+            0,
             "Steps between evaluations and checkpoints; a tenth of the run.",
         ),
         ("evaluate_on", Literal["held_out", "training"], "held_out", "Scenarios that are played."),
@@ -85,13 +85,16 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
             name: one._replace(value=_like(held[name], one.value)) if name in held else one
             for name, one in settings.items()
         }
+        own["evaluate_every"] = before.evaluate_every
+    else:
+        own["evaluate_every"] = _tenth(settings)
     groups = option_fields(settings, everything=everything)
     defaults = {**own, **{name: one.value for name, one in settings.items()}}
     members: list[Any] = [
         (
             "env",
-            Annotated[Positional[str | None], tyro.conf.arg(help=f"One of {environments()}.")],
-            dataclasses.field(default=None if before is None else before.env),
+            Annotated[str, Positional, tyro.conf.arg(help=f"One of {environments()}.")],
+            dataclasses.field(default="" if before is None else before.env),
         )
     ]
     for group in GROUPS:
@@ -105,6 +108,12 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     made = dataclasses.make_dataclass("Train", members)
     made.__doc__ = "Train one policy: progress, then the evaluation table; a run folder."
     return made, defaults
+
+
+def _tenth(settings: Mapping[str, Setting]) -> int:
+    """The default of evaluate_every: a tenth of a run with these settings."""
+    names = ("total_steps", "demonstrations", "decision_interval")
+    return default_interval(TrainConfig(**{name: settings[name].value for name in names}))
 
 
 def _like(value: Any, model: Any) -> Any:
@@ -167,7 +176,7 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
         if contradicting:
             raise UserError(f"cannot resume {str(out)!r}: its {'; its '.join(contradicting)}")
         return TrainRequest(settings=before, out=out, resume=True)
-    if parsed.env is None:
+    if not parsed.env:
         raise UserError(f"env: name the environment, one of {environments()}")
     expert = flat_options["expert"]
     settings = run_settings(
@@ -180,12 +189,9 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
         scenarios=flat_options["scenarios"],
         held_out_scenarios=flat_options["held_out_scenarios"],
         evaluate_on=flat_options["evaluate_on"],
-        evaluate_every=flat_options["evaluate_every"],
+        evaluate_every=given.get("evaluate_every"),
         given={k: v for k, v in given.items() if k not in _NOT_SETTINGS},
     )
-    if flat_options["evaluate_every"] is None:
-        every = default_interval(settings.config)
-        settings = dataclasses.replace(settings, evaluate_every=every)
     return TrainRequest(settings=settings, out=out, resume=False)
 
 

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from envs import pretrained
 from experiments.engine.evaluate import (
     EvaluationRow,
     policy_path,
@@ -24,15 +25,16 @@ from experiments.report.tables import write_rows
 TRAINING = ("episodic_return", "episodic_cost", "success_rate", "multiplier", "action_std")
 
 
-def write_card(run: Path, out: Path) -> None:
+def write_card(run: Path, out: Path, *, force: bool = False) -> None:
     """Write ENV.npz, ENV.json and ENV.csv (its curve) of a finished run of `ppl expert train`.
 
     Args:
         run: Run folder.
-        out: Folder to write to.
+        out: Folder to write to; never the package's own.
+        force: Whether existing files are replaced.
 
     Raises:
-        UserError: If the run is none of an expert, or has not finished.
+        UserError: If the run is none of an expert, or has not finished, or a file would be lost.
     """
     folder = RunFolder(run)
     try:
@@ -43,6 +45,7 @@ def write_card(run: Path, out: Path) -> None:
         raise UserError(f"{str(run)!r} is no finished run of `ppl expert train`")
     summary, env = folder.read_json(SUMMARY), config["env"]
     rows = read_evaluation(run)
+    refuse_to_overwrite(out, env, force=force)
     out.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(policy_path(run), out / f"{env}.npz")
     write_rows(out / f"{env}.csv", curve(folder, rows))
@@ -68,6 +71,21 @@ def write_card(run: Path, out: Path) -> None:
         "revision": config["revision"],
     }
     (out / f"{env}.json").write_text(json.dumps(card, indent=2) + "\n")
+
+
+def refuse_to_overwrite(out: Path, env: str, *, force: bool) -> None:
+    """Check that a card written to `out` replaces neither a shipped file nor, unforced, another.
+
+    Raises:
+        UserError: One line naming the folder or file.
+    """
+    shipped = Path(pretrained.__file__).parent.resolve()
+    if out.resolve().is_relative_to(shipped):
+        raise UserError(f"out {str(out)!r} holds the shipped experts: give another --out")
+    for ending in ("npz", "csv", "json"):
+        path = out / f"{env}.{ending}"
+        if path.exists() and not force:
+            raise UserError(f"{str(path)!r} exists: give another --out, or --force to replace it")
 
 
 def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:

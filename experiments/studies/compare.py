@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envs import card
 from experiments.engine.progress import Progress
 from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, traced_values
 from experiments.report.tables import EPISODES, RESULTS, write_rows
+from ppl_jax.cards import card
 
 if TYPE_CHECKING:
     from experiments.cli import Ablation, Compare, Tune

@@ -68,6 +68,17 @@ STUDIES = {
 }
 
 
+def register_study(name: str, study: Study) -> None:
+    """Make a study known by name, to `ppl sweep --study NAME`.
+
+    Raises:
+        ValueError: If the name is taken.
+    """
+    if name in STUDIES:
+        raise ValueError(f"study {name!r} is registered already")
+    STUDIES[name] = study
+
+
 @dataclasses.dataclass(frozen=True)
 class Run:
     """One run of a sweep.
@@ -98,10 +109,10 @@ class Group:
 
 def points(axes: Values) -> list[dict[str, Any]]:
     """Every combination of the axes' values, the last axis fastest."""
-    for name, values in axes.items():
-        if len(set(values)) != len(values):
-            raise UserError(f"{name}: every value once, got {', '.join(map(str, values))}")
-    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    for name, listed in axes.items():
+        if len(set(listed)) != len(listed):
+            raise UserError(f"{name}: every value once, got {', '.join(map(str, listed))}")
+    return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
 
 def run_name(env: str, algorithm: str, values: Mapping[str, Any], seed: int) -> str:

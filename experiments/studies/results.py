@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.files import write_text_atomic
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import traced_values
 from experiments.report.tables import EPISODES, RESULTS
@@ -142,13 +144,11 @@ class Results:
         ):
             rows = [row for run in self.runs for row in found.get(run.name, [])]
             rows += [row for kept in self.kept.values() for row in kept[at]]
-            path = self.out / name
-            temporary = path.with_suffix(".tmp")
-            with open(temporary, "w", newline="") as file:
-                writer = csv.DictWriter(file, columns, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-            os.replace(temporary, path)
+            text = io.StringIO()
+            writer = csv.DictWriter(text, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+            write_text_atomic(self.out / name, text.getvalue())
 
 
 def _read(path: Path, columns: Sequence[str]) -> dict[str, list[dict[str, str]]]:

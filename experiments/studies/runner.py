@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envs import card, known, unknown
+from envs.registry import known, unknown
 from experiments.engine import schedulers as engines
+from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
 from experiments.engine.runtime import UserError, revision, versions
 from experiments.engine.settings import (
@@ -23,9 +23,20 @@ from experiments.engine.settings import (
     traced_values,
 )
 from experiments.engine.worker import Job, Reply
-from experiments.studies.grid import STUDIES, Group, Run, group_key, groups, points, run_name, widen
+from experiments.studies.grid import (
+    STUDIES,
+    Group,
+    Run,
+    Study,
+    group_key,
+    groups,
+    points,
+    run_name,
+    widen,
+)
 from experiments.studies.results import Results
 from ppl_jax import algorithms
+from ppl_jax.cards import card
 from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
@@ -34,6 +45,22 @@ if TYPE_CHECKING:
 SETTINGS = "sweep.json"
 LOG = "workers.log"
 COMPILE_S = 25.0  # of a program that was never compiled before
+
+
+def _study(command: Sweep) -> Study | None:
+    """The study that a command names.
+
+    Raises:
+        UserError: If there is none of that name.
+    """
+    if command.study is None:
+        return None
+    if command.study not in STUDIES:
+        raise UserError(
+            f"study must be one of {', '.join(STUDIES)}, got {command.study!r}"
+            + did_you_mean(command.study, STUDIES)
+        )
+    return STUDIES[command.study]
 
 
 def plan(command: Sweep) -> list[Run]:
@@ -58,7 +85,7 @@ def plan(command: Sweep) -> list[Run]:
 
 def _axes(command: Sweep, env: str) -> dict[str, tuple[Any, ...]]:
     given = dict(command.axes)
-    study = dict(STUDIES[command.study].axes) if command.study else {}
+    study = dict(found.axes) if (found := _study(command)) else {}
     if env != "driving" and command.study == "predictor" and "predictor" not in given:
         raise UserError(f"study predictor is for driving, which alone has two, got {env}")
     return study | given
@@ -81,7 +108,7 @@ def _points(command: Sweep, env: str, algorithm: str) -> list[dict[str, Any]]:
 
 
 def _algorithms(command: Sweep) -> tuple[str, ...]:
-    study = STUDIES[command.study] if command.study else None
+    study = _study(command)
     return command.algorithms or (study.algorithms if study else ("ppl",))
 
 
@@ -107,7 +134,7 @@ def _settings(
     common = {name: getattr(command, name) for name in _COMMON}
     settings = run_settings(env, algorithm, seed, **common, given=given)
     config = settings.config
-    study = STUDIES[command.study] if command.study else None
+    study = _study(command)
     if study and command.total_steps is None and study.length != 1:
         config = dataclasses.replace(config, total_steps=int(config.total_steps * study.length))
     every = command.evaluate_every
@@ -201,9 +228,7 @@ def _open(out: Path, content: dict[str, Any]) -> None:
         raise UserError(f"{str(out)!r} holds something else: give another --out")
     out.mkdir(parents=True, exist_ok=True)
     about = {"versions": versions(), "revision": revision()}
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(about | content, indent=1) + "\n")
-    os.replace(temporary, path)
+    write_text_atomic(path, json.dumps(about | content, indent=1) + "\n")
 
 
 def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], command: Sweep) -> int:

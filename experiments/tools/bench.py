@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import make
 from envs.driving.make import make_driving
 from envs.manipulation.scenes.model import SUBSTEPS
+from envs.registry import make
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
 from ppl_jax import algorithms

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from envs import card, registered
+from envs.registry import registered
 from experiments.studies.grid import STUDIES
 from ppl_jax import algorithms
+from ppl_jax.cards import card
 from ppl_jax.config import PRESETS
 from ppl_jax.gates import gate, registered_gates
 from ppl_jax.losses import OBJECTIVES

@@ -1,19 +1,22 @@
-"""`ppl play`: a session from settings to summary; `ppl replay`: looking at one again."""
+"""`ppl play`: a session from its settings to its summary."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from experiments.engine.run import build_world, open_folder
 from experiments.engine.run_folder import RunFolder
-from experiments.engine.runtime import UserError
-from experiments.engine.settings import RunSettings, check
-from experiments.ui.session import Question, Session, SessionConfig
-from experiments.ui.views import RATES
+from experiments.engine.runtime import UserError, need
+from experiments.engine.settings import RunSettings, check, one_level
+from experiments.ui.config import Question, SessionConfig
+from experiments.ui.views import display_of, make_view
 
 PARTICIPANT = re.compile(r"[A-Za-z0-9_-]{0,32}")
 LONGEST_TEXT = 20_000  # letters of a consent text
@@ -22,44 +25,40 @@ LONGEST_TEXT = 20_000  # letters of a consent text
 def play(
     settings: RunSettings,
     out: Path,
-    resume: bool,
-    sitting: SessionConfig,
-    manual_episodes: int = 0,
+    session_config: SessionConfig,
+    *,
+    resume: bool = False,
     host: str = "127.0.0.1",
     port: int = 8765,
     exposed: bool = False,
 ) -> None:
-    """Serve a session until it is complete or the person has had enough.
+    """Serve a session until it is complete or the person quits.
 
     Raises:
         UserError: If settings, folder or address cannot be used.
     """
     server = web()
     check(settings)
-    if settings.env not in RATES:
-        raise UserError(f"env: {settings.env} cannot be shown, choose {', '.join(RATES)}")
-    for name, value in (
-        ("familiarisation", sitting.familiarisation),
-        ("manual_episodes", manual_episodes),
-    ):
-        if value < 0:
-            raise UserError(f"{name} must not be negative, got {value}")
-    if not PARTICIPANT.fullmatch(sitting.participant):
-        raise UserError(
-            f"participant must be at most 32 letters, digits, - and _, got {sitting.participant!r}"
-        )
+    display_of(settings.env)
+    _check_session(session_config)
+    from experiments.ui.session import Session
     from experiments.ui.trainer import InteractiveTrainer
-    from experiments.ui.views import make_view
 
-    served = server.listen(host, port, exposed)
-    with served:
+    with server.listen(host, port, exposed) as served:
         env = build_world(settings)
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)
         try:
             folder = RunFolder(out)
-            trainee = InteractiveTrainer(settings, folder, env, view.place, manual_episodes)
-            about = {"participant": sitting.participant, "manual_episodes": manual_episodes}
+            trainer = InteractiveTrainer(
+                settings,
+                folder,
+                env,
+                view.place,
+                manual_episodes=session_config.manual_episodes,
+            )
+            # a folder that is resumed keeps its session settings: `resumed` has read them
+            about = {} if resume else session_config.as_json()
             open_folder(folder, settings.as_json() | about, resume)
         except ValueError as error:
             view.close()
@@ -72,8 +71,86 @@ def play(
                 "warning: others on the network can reach this page; nothing is encrypted",
                 file=sys.stderr,
             )
-        server.serve(hub, Session(trainee, view, sitting, hub.publish), served, exposed)
+        session = Session(trainer, view, session_config, hub.publish)
+        server.serve(hub, session, served, exposed=exposed)
     print(f"the session is in {out}")
+    if not session.trainer.complete:
+        print(f"continue with: {shlex.join(('ppl', 'play', '--resume', '--out', str(out)))}")
+
+
+def _check_session(session_config: SessionConfig) -> None:
+    if not 0.1 <= session_config.rate <= 1000:
+        raise UserError(f"rate must lie between 0.1 and 1000, got {session_config.rate}")
+    for name in ("familiarisation", "manual_episodes"):
+        value = getattr(session_config, name)
+        if value < 0:
+            raise UserError(f"{name} must not be negative, got {value}")
+    if not PARTICIPANT.fullmatch(session_config.participant):
+        raise UserError(
+            "participant must be at most 32 letters, digits, - and _, got "
+            f"{session_config.participant!r}"
+        )
+
+
+def new_session(env: str, given: Mapping[str, Any]) -> SessionConfig:
+    """The settings of a new session.
+
+    Args:
+        env: Name of the environment, which has a control rate.
+        given: Settings that the user gave, by name; those of the run among them are left out.
+
+    Raises:
+        UserError: If the environment cannot be shown.
+    """
+    names = {field.name for field in dataclasses.fields(SessionConfig)}
+    mine: dict[str, Any] = {"rate": display_of(env).control_rate}
+    mine |= {name: value for name, value in given.items() if name in names}
+    return SessionConfig(**mine)
+
+
+def resumed(out: Path, given: Mapping[str, Any]) -> tuple[RunSettings, SessionConfig]:
+    """The settings of the session in a run folder.
+
+    Args:
+        out: The run folder.
+        given: Settings of run and session that the user gave, by flat name; each must agree.
+
+    Raises:
+        UserError: If there is no session, or with one line that names each contradiction.
+    """
+    try:
+        content = RunFolder(out).config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    settings = RunSettings.from_json(content)
+    if settings.expert != "person":
+        raise UserError(
+            f"cannot resume {str(out)!r} with ppl play: its expert is {settings.expert!r}; use "
+            "ppl train --resume"
+        )
+    session_config = SessionConfig.from_json(content, display_of(settings.env).control_rate)
+    held = _held(settings.as_json()) | vars(session_config)
+    wrong = [
+        f"{name} is {_short(held.get(name))}, asked for {_short(value)}"
+        for name, value in given.items()
+        if held.get(name) != value
+    ]
+    if wrong:
+        raise UserError(f"cannot resume {str(out)!r}: its {'; its '.join(wrong)}")
+    return settings, session_config
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _held(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's config.json as one level of names; L is "auto" where it adapts."""
+    flat = one_level(content)
+    if flat.get("adaptive_horizon"):
+        flat["preference_horizon"] = "auto"
+    return flat
 
 
 def web() -> Any:
@@ -82,12 +159,10 @@ def web() -> Any:
     Raises:
         UserError: If it is not installed.
     """
-    try:
-        from experiments.ui import server
-    except ImportError as error:
-        raise UserError(
-            f"the human interface needs the package {error.name}: pip install 'ppl-jax[ui]'"
-        ) from error
+    for module in ("msgspec", "starlette", "uvicorn", "websockets"):
+        need(module, "ui", "the human interface")
+    from experiments.ui import server
+
     return server
 
 
@@ -110,12 +185,16 @@ def read_questions(path: Path) -> tuple[Question, ...]:
     """Questions: a JSON list of {"name", "text", and "choices" where it has any}.
 
     Raises:
-        UserError: If it cannot be read, or is something else.
+        UserError: If it cannot be read, or is no such list.
     """
     try:
         content = json.loads(path.read_text())
         questions = tuple(
-            Question(str(one["name"]), str(one["text"]), tuple(map(str, one.get("choices", []))))
+            Question(
+                name=str(one["name"]),
+                text=str(one["text"]),
+                choices=tuple(map(str, one.get("choices", []))),
+            )
             for one in content
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

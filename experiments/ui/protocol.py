@@ -1,14 +1,17 @@
-"""What a page may say, and how it is checked. Nothing else of a message is believed."""
+"""Messages that a page may send, and how they are checked. Nothing else of a message is used."""
 
 from __future__ import annotations
 
-import json
-import math
-from typing import Any, NamedTuple
+import re
+from typing import Annotated, Literal, get_args
+
+import msgspec
+from msgspec import Meta
 
 LONGEST = 4096  # bytes of a message
 PER_SECOND, BURST = 100, 200  # messages that are read; the rest are dropped and counted
-ORDERS = (
+
+OrderName = Literal[
     "start",  # from the questions before, or after a pause
     "pause",
     "restart",  # leave the episode
@@ -16,11 +19,22 @@ ORDERS = (
     "save",
     "quit",
     "control",  # take the controls, where nobody has them
-)
+]
+ORDERS: tuple[str, ...] = get_args(OrderName)
+
+FrameNumber = Annotated[int, Meta(ge=0, lt=2**31)]
+Name = Annotated[str, Meta(max_length=64)]
+Answer = Annotated[str, Meta(max_length=2000)] | int | float
 
 
-class Input(NamedTuple):
-    """What the person's hands do.
+class _Message(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower
+):
+    """A JSON object whose "kind" is the name of its class in small letters."""
+
+
+class Input(_Message, frozen=True):
+    """State of the person's controls.
 
     Attributes:
         seen: Number of the newest frame that the page has shown.
@@ -28,36 +42,49 @@ class Input(NamedTuple):
         action: Each in [-1, 1].
     """
 
-    seen: int
+    seen: FrameNumber
     takeover: bool
     action: tuple[float, ...]
 
 
-class Order(NamedTuple):
+class Order(_Message, frozen=True):
     """Something to do, one of `ORDERS`."""
 
-    order: str
+    order: OrderName
 
 
-class Consent(NamedTuple):
+class Consent(_Message, frozen=True):
     """Whether the person agrees to the text that was shown."""
 
     agreed: bool
 
 
-class Answers(NamedTuple):
+class Answers(_Message, frozen=True):
     """Answers to the questions after an episode, by the questions' names."""
 
-    answers: dict[str, str | float]
+    answers: Annotated[dict[Name, Answer], Meta(max_length=100)]
 
 
-class Seek(NamedTuple):
+class Seek(_Message, frozen=True):
     """Go to a step of a recording."""
 
-    step: int
+    step: FrameNumber
 
 
 Message = Input | Order | Consent | Answers | Seek
+
+_DECODER = msgspec.json.Decoder(Message)
+_ALLOWED = {
+    "kind": "input, order, consent, answers or seek",
+    "seen": "the number of a frame",
+    "step": "the number of a step",
+    "takeover": "true or false",
+    "agreed": "true or false",
+    "action": "a list of finite numbers",
+    "order": f"one of {', '.join(ORDERS)}",
+    "answers": "an object of at most 100 texts (of at most 2000 letters) or numbers",
+}
+_FIELD = re.compile(r"`\$\.(\w+)")
 
 
 class Malformed(ValueError):
@@ -69,7 +96,7 @@ def parse(text: str | bytes, action_size: int) -> Message:
 
     Args:
         text: As it came.
-        action_size: A of the world.
+        action_size: A of the env.
 
     Raises:
         Malformed: If it is not exactly one of the messages above.
@@ -77,79 +104,25 @@ def parse(text: str | bytes, action_size: int) -> Message:
     if len(text) > LONGEST:
         raise Malformed(f"longer than {LONGEST} bytes")
     try:
-        content = json.loads(text, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
+        message = _DECODER.decode(text)
+    except msgspec.ValidationError as error:
+        raise Malformed(_reason(error)) from error
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise Malformed("not JSON") from error
-    if not isinstance(content, dict):
-        raise Malformed("not an object")
-    kind = content.get("kind")
-    if kind == "input":
-        _only(content, {"kind", "seen", "takeover", "action"})
-        return Input(
-            _whole(content.get("seen")),
-            _flag(content.get("takeover"), "takeover"),
-            _action(content.get("action"), action_size),
-        )
-    if kind == "order":
-        _only(content, {"kind", "order"})
-        order = content.get("order")
-        if not isinstance(order, str) or order not in ORDERS:
-            raise Malformed(f"order must be one of {', '.join(ORDERS)}")
-        return Order(order)
-    if kind == "consent":
-        _only(content, {"kind", "agreed"})
-        return Consent(_flag(content.get("agreed"), "agreed"))
-    if kind == "answers":
-        _only(content, {"kind", "answers"})
-        return Answers(_answers(content.get("answers")))
-    if kind == "seek":
-        _only(content, {"kind", "step"})
-        return Seek(_whole(content.get("step")))
-    raise Malformed("kind must be input, order, consent, answers or seek")
+    if not isinstance(message, Input):
+        return message
+    if len(message.action) != action_size:
+        raise Malformed(f"action must be {action_size} numbers, got {len(message.action)}")
+    action = tuple(min(1.0, max(-1.0, part)) for part in message.action)
+    return msgspec.structs.replace(message, action=action)
 
 
-def _no_constant(name: str) -> float:
-    raise ValueError(name)
-
-
-def _only(content: dict[str, Any], fields: set[str]) -> None:
-    if set(content) != fields:
-        raise Malformed(f"needs the fields {', '.join(sorted(fields))} and no other")
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
-        raise Malformed("seen and step must be numbers of a frame")
-    return value
-
-
-def _flag(value: Any, name: str) -> bool:
-    if not isinstance(value, bool):
-        raise Malformed(f"{name} must be true or false")
-    return value
-
-
-def _number(value: Any) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return math.isfinite(value) if isinstance(value, float) else abs(value) < 2**31
-
-
-def _action(value: Any, size: int) -> tuple[float, ...]:
-    if not isinstance(value, list) or len(value) != size or not all(map(_number, value)):
-        raise Malformed(f"action must be {size} numbers")
-    return tuple(min(1.0, max(-1.0, float(part))) for part in value)
-
-
-def _answers(value: Any) -> dict[str, str | float]:
-    if not isinstance(value, dict) or len(value) > 100:
-        raise Malformed("answers must be an object")
-    for name, answer in value.items():
-        if len(name) > 64 or not (isinstance(answer, str) or _number(answer)):
-            raise Malformed("an answer must be a text or a number")
-        if isinstance(answer, str) and len(answer) > 2000:
-            raise Malformed("an answer must not be longer than 2000 letters")
-    return value
+def _reason(error: msgspec.ValidationError) -> str:
+    """The field and the values it may have; the library's own line where no field is wrong."""
+    found = _FIELD.search(str(error))
+    if found is None or found[1] not in _ALLOWED:
+        return str(error)
+    return f"{found[1]} must be {_ALLOWED[found[1]]}"
 
 
 class Allowance:

@@ -13,19 +13,20 @@ import numpy as np
 from experiments.engine import recording
 from experiments.engine.evaluate import make_world
 from experiments.engine.runtime import UserError
+from experiments.ui.config import participant_of
 from experiments.ui.play import web
 from experiments.ui.protocol import Message, Order, Seek
 from experiments.ui.session import Clock
-from experiments.ui.views import RATES, Shown, View, make_view
+from experiments.ui.views import Shown, View, display_of, make_view
 from ppl_jax.types import Env
 
 
 class Replay:
-    """A recording as the server shows it.
+    """A recording as a `SessionBackend`.
 
     Attributes:
         stage: "ready", "running", "paused" or "stopped".
-        at: Step that is shown next.
+        at: The step to show next.
     """
 
     lingers = False
@@ -35,6 +36,7 @@ class Replay:
         env: Env,
         columns: recording.Columns,
         config: dict[str, Any],
+        *,
         view: View,
         publish: Callable[[dict[str, Any]], None],
         rate: float,
@@ -57,7 +59,7 @@ class Replay:
         self._inbox.put(message)
 
     def left(self) -> None:
-        """Nobody looks."""
+        """No page is open."""
         self._inbox.put(Order("pause"))
 
     def stop(self) -> None:
@@ -65,7 +67,7 @@ class Replay:
         self._inbox.put(Order("quit"))
 
     def about(self) -> dict[str, Any]:
-        """What a page has to know first."""
+        """The first message to a page."""
         return {
             "kind": "about",
             "env": self.config["env"],
@@ -73,13 +75,14 @@ class Replay:
             "rate": self.rate,
             "total": self.length,
             "actions": self.columns["executed_action"].shape[1],
+            "drawing": self.view.drawing,
             "azimuth": self.view.azimuth,
-            "participant": self.config.get("participant", ""),
+            "participant": participant_of(self.config),
             "replay": True,
         }
 
     def status(self) -> dict[str, Any]:
-        """The stage."""
+        """The message that shows the stage on a page."""
         return {"kind": "status", "stage": self.stage, "note": "", "in_a_row": 0} | {
             "familiarisation": 0
         }
@@ -89,7 +92,7 @@ class Replay:
         self.publish(self.status())
 
     def run(self) -> None:
-        """Until somebody has seen enough."""
+        """Show the recording until a page quits."""
         clock = Clock(self.rate)
         clock.start()
         self._show()
@@ -137,7 +140,7 @@ class Replay:
         if episode != self._episode:
             self._episode = episode
             self.publish({"kind": "scene"} | self.view.scene(state))
-        shown = Shown(columns[recording.AHEAD][t], bool(columns[recording.FAILS][t]))
+        shown = Shown(novice=columns[recording.AHEAD][t], fails=bool(columns[recording.FAILS][t]))
         self.frames += 1
         ended = None
         if columns["terminated"][t] | columns["truncated"][t]:
@@ -158,21 +161,23 @@ class Replay:
         self.view.picture(self.frames, state, shown)
 
 
-def replay(path: Path, host: str, port: int, exposed: bool) -> None:
-    """Serve a recording until somebody has seen enough.
+def replay(path: Path, host: str, port: int, exposed: bool = False) -> None:
+    """Serve a recording until a page quits.
 
     Raises:
-        UserError: If there is none, or the address cannot be had.
+        UserError: If there is none, or the address is not available.
     """
     server = web()
     columns, config = recording.load(path)
-    name = config.get("env")
-    if name not in RATES:
-        raise UserError(f"recording {str(path)!r} is of {name!r}, which cannot be shown")
+    name = str(config.get("env"))
+    try:
+        rate = display_of(name).control_rate
+    except UserError as error:
+        raise UserError(f"recording {str(path)!r} cannot be shown: {error}") from error
     names = ("scenarios", "held_out_scenarios")
     env = make_world(name, {key: v for key in names if (v := config.get(key)) is not None})
     with server.listen(host, port, exposed) as served:
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)
-        shown = Replay(env, columns, config, view, hub.publish, RATES[name])
-        server.serve(hub, shown, served, exposed)
+        shown = Replay(env, columns, config, view=view, publish=hub.publish, rate=rate)
+        server.serve(hub, shown, served, exposed=exposed)

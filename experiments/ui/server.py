@@ -1,7 +1,7 @@
 """The local web server of a session: one page, one socket each, one pair of hands at the controls.
 
-Whoever opens the address with its one-time token gets a cookie; page and socket need it. The first
-page has the controls, others watch. Needs the `ui` extra.
+Opening the address with its one-time token gives a cookie; page and socket need it. The first page
+has the controls, others watch. Needs the `ui` extra.
 """
 
 from __future__ import annotations
@@ -55,20 +55,21 @@ HEADERS = {
 
 
 class SessionBackend(Protocol):
-    """What the server shows: a session, or the replay of one.
+    """A session, or the replay of one, as the server runs it.
 
     Attributes:
-        lingers: Its end is still to be seen when `run` is over.
+        lingers: Whether the page stays open after `run`, for the end to be read.
     """
 
-    lingers: bool
+    @property
+    def lingers(self) -> bool: ...  # noqa: D102 - above
 
     def run(self) -> None:
-        """Until it is over."""
+        """Run until it is over."""
         ...
 
     def receive(self, message: Message) -> None:
-        """A message of the page that has the controls."""
+        """Take a message of the page that has the controls."""
         ...
 
     def left(self) -> None:
@@ -89,7 +90,7 @@ class SessionBackend(Protocol):
 
 
 class _Mailbox:
-    """What is still to be sent to a page: everything, but of frames and pictures the newest."""
+    """Messages to be sent to a page: all of them, but only the newest frame and picture."""
 
     def __init__(self) -> None:
         self.messages: list[str] = []
@@ -112,20 +113,21 @@ class _Mailbox:
 
 
 class Hub:
-    """The pages, who has the controls, and the keys to the door.
+    """The pages, the one that has the controls, and the secrets that let a browser in.
 
     Attributes:
         secret: Value of the cookie.
-        token: Opens the door once; None when it has.
+        token: Lets one browser in; None once it has.
         rejected: Messages that were malformed, too many, or from a page that only watches.
     """
 
     def __init__(self, action_size: int):
         self.action_size = action_size
-        self.secret, self.token = secrets.token_urlsafe(32), None
+        self.secret = secrets.token_urlsafe(32)
+        self.token: str | None = None
         self.pages: dict[WebSocket, _Mailbox] = {}
         self.controller: WebSocket | None = None
-        self.performance: SessionBackend | None = None
+        self.backend: SessionBackend | None = None
         self.loop: asyncio.AbstractEventLoop | None = None
         self.kept: dict[str, str | bytes] = {}
         self.rejected = 0
@@ -133,7 +135,7 @@ class Hub:
         self.on_quit: Callable[[], None] = lambda: None
 
     def new_token(self) -> str:
-        """A token for one more browser; an unused one before it is void."""
+        """A token for one more browser; an earlier unused one becomes void."""
         self.token = secrets.token_urlsafe(24)
         return self.token
 
@@ -149,7 +151,7 @@ class Hub:
 
     def _post(self, kind: str, message: str | bytes) -> None:
         if self.loop is not None and not self.loop.is_closed():
-            with contextlib.suppress(RuntimeError):  # it closes
+            with contextlib.suppress(RuntimeError):  # the loop is closing
                 self.loop.call_soon_threadsafe(self._deliver, kind, message)
 
     # in the loop
@@ -160,11 +162,11 @@ class Hub:
             mailbox.put(kind, message)
 
     def join(self, page: WebSocket) -> _Mailbox:
-        """A page has come: tell it all it has to know."""
-        assert self.performance is not None
+        """Add a page and send it the present state."""
+        assert self.backend is not None
         mailbox = self.pages[page] = _Mailbox()
-        mailbox.put("about", json.dumps(self.performance.about()))
-        mailbox.put("status", json.dumps(self.performance.status()))
+        mailbox.put("about", json.dumps(self.backend.about()))
+        mailbox.put("status", json.dumps(self.backend.status()))
         for kind in ("scene", "frame", "picture"):
             if kind in self.kept:
                 mailbox.put(kind, self.kept[kind])
@@ -174,12 +176,12 @@ class Hub:
         return mailbox
 
     def leave(self, page: WebSocket) -> None:
-        """A page is gone."""
+        """Remove a page; the session pauses if it had the controls."""
         self.pages.pop(page, None)
         if page is self.controller:
             self.controller = None
-            if self.performance is not None:
-                self.performance.left()
+            if self.backend is not None:
+                self.backend.left()
         self._tell_roles()
         if not self.pages:
             self.on_empty()
@@ -191,7 +193,7 @@ class Hub:
             mailbox.put("role", json.dumps(role))
 
     def hear(self, page: WebSocket, text: str | bytes) -> None:
-        """A page says something."""
+        """Check a message of a page and pass it on."""
         try:
             message = parse(text, self.action_size)
         except Malformed as error:
@@ -205,8 +207,8 @@ class Hub:
         if page is not self.controller:
             self._reject(page, "another page has the controls")
             return
-        assert self.performance is not None
-        self.performance.receive(message)
+        assert self.backend is not None
+        self.backend.receive(message)
         if message == Order("quit"):
             self.on_quit()
 
@@ -220,8 +222,8 @@ def make_app(hub: Hub, hosts: list[str]) -> Starlette:
     """The web application of a hub.
 
     Args:
-        hub: Of the session.
-        hosts: Names under which it may be asked for; "*" for any.
+        hub: The session's.
+        hosts: Host names that requests may use; "*" for any.
     """
 
     def known(connection: HTTPConnection) -> bool:
@@ -236,8 +238,7 @@ def make_app(hub: Hub, hosts: list[str]) -> Starlette:
         if given is not None:
             if hub.token is None or not _same(given, hub.token):
                 return PlainTextResponse(
-                    "This address was used already. The terminal shows a new one when no page is "
-                    "open.",
+                    "This address has been used. With no page open, the terminal shows a new one.",
                     403,
                     HEADERS,
                 )
@@ -304,8 +305,8 @@ def listen(host: str, port: int, exposed: bool) -> socket.socket:
     """The socket to serve on.
 
     Raises:
-        UserError: If the address is not of this machine alone and that was not asked for, or
-            cannot be had.
+        UserError: If others can reach the address and that was not asked for, or if it is not
+            available.
     """
     if host not in LOOPBACK and not exposed:
         raise UserError(
@@ -318,7 +319,7 @@ def listen(host: str, port: int, exposed: bool) -> socket.socket:
     served.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         served.bind((host, port))
-        served.listen(64)  # whoever opens the address at once is kept waiting, not refused
+        served.listen(64)  # a page that opens the address at once waits and is not refused
     except (OSError, OverflowError) as error:
         served.close()
         raise UserError(f"port: cannot listen on {host}:{port} ({error})") from error
@@ -327,78 +328,99 @@ def listen(host: str, port: int, exposed: bool) -> socket.socket:
 
 def serve(
     hub: Hub,
-    performance: SessionBackend,
+    backend: SessionBackend,
     served: socket.socket,
+    *,
     exposed: bool = False,
     tell: Callable[[str], None] = print,
 ) -> None:
-    """Serve until the performance is over and the person has seen it.
+    """Serve until the backend is over and the person has seen its end.
 
     Args:
-        hub: That it publishes to.
-        performance: Runs in a thread of its own.
-        served: Of `listen`.
-        exposed: Any name of this machine will do.
+        hub: The one that the backend publishes to.
+        backend: Runs in a thread of its own.
+        served: From `listen`.
+        exposed: Accept requests under any host name.
         tell: Prints a line.
 
     Raises:
-        Exception: Whatever ended the performance.
+        Exception: The one that ended the backend.
     """
-    host, port = served.getsockname()[:2]
-    shown = f"[{host}]" if ":" in host else host
-    hub.performance = performance
-    failure: list[BaseException] = []
-
-    def perform() -> None:
-        try:
-            performance.run()
-        except BaseException as error:
-            failure.append(error)
-        finally:
-            over.set()
-            if failure or not performance.lingers or seen.is_set():
-                server.should_exit = True
-
-    def invite() -> None:
-        if not over.is_set():
-            tell(f"open http://{shown}:{port}/?token={hub.new_token()}")
-
-    def quit_after_the_end() -> None:
-        seen.set()
-        if over.is_set():
-            server.should_exit = True
-
-    @contextlib.asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        del app
-        hub.loop = asyncio.get_running_loop()
-        hub.on_empty, hub.on_quit = invite, quit_after_the_end
-        invite()
-        thread.start()
-        yield
-        performance.stop()
-        await asyncio.to_thread(thread.join, 60)
-
-    over, seen = threading.Event(), threading.Event()
-    thread = threading.Thread(target=perform)
-    app = make_app(hub, ["*"] if exposed else [*LOOPBACK, "[::1]"])
-    app.router.lifespan_context = lifespan
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            log_level="warning",
-            ws="websockets-sansio",
-            ws_max_size=4 * LONGEST,
-            ws_ping_interval=5.0,
-            ws_ping_timeout=10.0,
-            limit_concurrency=64,
-            timeout_graceful_shutdown=2,
-            server_header=False,
-        )
-    )
-    with contextlib.suppress(KeyboardInterrupt):  # what was to be saved is saved by then
-        server.run(sockets=[served])
-    if failure:
-        raise failure[0]
+    serving = _Serving(hub, backend, served, exposed=exposed, tell=tell)
+    with contextlib.suppress(KeyboardInterrupt):  # everything is saved by then
+        serving.server.run(sockets=[served])
+    if serving.failure is not None:
+        raise serving.failure
     if hub.rejected:
         print(f"{hub.rejected} messages were rejected", file=sys.stderr)
+
+
+class _Serving:
+    """A backend in its thread and the web server beside it; either ends the other.
+
+    Attributes:
+        server: To be run.
+        failure: The exception that ended the backend, or None.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        backend: SessionBackend,
+        served: socket.socket,
+        *,
+        exposed: bool,
+        tell: Callable[[str], None],
+    ):
+        self.hub, self.backend, self.tell = hub, backend, tell
+        host, port = served.getsockname()[:2]
+        self.address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+        self.failure: BaseException | None = None
+        self.over, self.seen = threading.Event(), threading.Event()
+        self.thread = threading.Thread(target=self._run_backend)
+        hub.backend = backend
+        app = make_app(hub, ["*"] if exposed else [*LOOPBACK, "[::1]"])
+        app.router.lifespan_context = self._lifespan
+        self.server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                ws="websockets-sansio",
+                ws_max_size=4 * LONGEST,
+                ws_ping_interval=5.0,
+                ws_ping_timeout=10.0,
+                limit_concurrency=64,
+                timeout_graceful_shutdown=2,
+                server_header=False,
+            )
+        )
+
+    def _run_backend(self) -> None:
+        try:
+            self.backend.run()
+        except BaseException as error:
+            self.failure = error
+        finally:
+            self.over.set()
+            if self.failure is not None or not self.backend.lingers or self.seen.is_set():
+                self.server.should_exit = True
+
+    def _invite(self) -> None:
+        if not self.over.is_set():
+            self.tell(f"open {self.address}?token={self.hub.new_token()}")
+
+    def _quit_after_the_end(self) -> None:
+        self.seen.set()
+        if self.over.is_set():
+            self.server.should_exit = True
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
+        del app
+        self.hub.loop = asyncio.get_running_loop()
+        self.hub.on_empty, self.hub.on_quit = self._invite, self._quit_after_the_end
+        self._invite()
+        self.thread.start()
+        yield
+        self.backend.stop()
+        await asyncio.to_thread(self.thread.join, 60)

@@ -1,7 +1,7 @@
-"""A sitting with a person: who has control, when the clock runs, what is asked and what is kept.
+"""A session with a person: control, clock, questions and records.
 
-The server owns the clock: in every tick the newest hands count, whatever came before them is gone.
-Nothing here knows of the web; a test can be the person.
+The server owns the clock: in every tick the newest input counts, earlier ones are discarded.
+Nothing here depends on the web; a test can play the person.
 """
 
 from __future__ import annotations
@@ -15,57 +15,22 @@ from typing import Any
 
 import numpy as np
 
+from experiments.ui.config import SessionConfig
 from experiments.ui.protocol import Answers, Consent, Input, Message, Order
 from experiments.ui.trainer import InteractiveTrainer
 from experiments.ui.views import Shown, View
 from ppl_jax.interaction import Learner
 from ppl_jax.types import Interaction
 
-STALE = 0.5  # s without a word from the page after which its hands count as off the controls
+STALE = 0.5  # s without input from the page after which its hands count as off the controls
 ANSWERS, CONSENT = "answers.jsonl", "consent.json"
 
 Publish = Callable[[dict[str, Any]], None]
 """`publish(message)`: to every page."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Question:
-    """Something to ask after an episode.
-
-    Attributes:
-        name: Of its answers.
-        text: As shown.
-        choices: To choose from; any text where empty.
-    """
-
-    name: str
-    text: str
-    choices: tuple[str, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True)
-class SessionConfig:
-    """How a session goes.
-
-    Attributes:
-        rate: Steps per second.
-        participant: Who it is, as in the study's list; may be empty.
-        consent: Text to agree to before anything starts, or None.
-        familiarisation: Successes in a row, driving alone, before it counts.
-        questions: Asked after every episode.
-        evaluate: Play the held-out scenarios at the end.
-    """
-
-    rate: float
-    participant: str = ""
-    consent: str | None = None
-    familiarisation: int = 0
-    questions: tuple[Question, ...] = ()
-    evaluate: bool = True
-
-
 class Clock:
-    """Ticks of a fixed length; one that comes too late is counted, and not made up for.
+    """Ticks of a fixed length; a late one is counted, and not made up for.
 
     Attributes:
         ticks, missed: So far.
@@ -92,25 +57,26 @@ class Clock:
 
 
 class Session:
-    """The sitting itself; `run` it in a thread of its own.
+    """The session itself; `run` it in a thread of its own.
 
     Attributes:
         stage: "preparing", "consent", "ready", "practice", "running", "paused", "questions",
             "finished", "stopped" or "failed".
-        late: Ticks for which no word had come from the page since the last one.
+        late: Ticks for which no input had come from the page since the one before.
     """
 
     def __init__(
         self,
-        trainee: InteractiveTrainer,
+        trainer: InteractiveTrainer,
         view: View,
-        sitting: SessionConfig,
+        session_config: SessionConfig,
         publish: Publish,
+        *,
         tell: Callable[[str], None] = print,
     ):
-        self.trainee, self.view, self.sitting = trainee, view, sitting
+        self.trainer, self.view, self.session_config = trainer, view, session_config
         self.publish, self.tell = publish, tell
-        self.clock, self.stage, self.note = Clock(sitting.rate), "preparing", ""
+        self.clock, self.stage, self.note = Clock(session_config.rate), "preparing", ""
         self.late = self.frames = 0
         self.in_a_row = 0
         self._inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
@@ -118,12 +84,12 @@ class Session:
         self._fresh = False
         self._sent: dict[int, float] = {}
         self._spare: Learner | None = None
-        self._agreed = sitting.consent is None
+        self._agreed = session_config.consent is None
         self._tick_ms = 0.0
 
     @property
     def lingers(self) -> bool:
-        """Its result is still to be read when it is over."""
+        """Whether the page stays open, for its result to be read."""
         return self.stage == "finished"
 
     # from outside, in any thread
@@ -144,12 +110,12 @@ class Session:
         """Save and end."""
         self._inbox.put(Order("quit"))
 
-    # the sitting
+    # the session
 
     def run(self) -> None:
-        """Prepare, then go on until it is complete or the person has had enough."""
+        """Prepare, then run until it is complete or the person quits."""
         try:
-            self.trainee.prepare(self._preparing)
+            self.trainer.prepare(self._preparing)
             self._ready()
             while self.stage not in ("stopped", "finished"):
                 self._orders()
@@ -160,68 +126,69 @@ class Session:
             self._go("failed", f"{type(error).__name__}: {str(error).splitlines()[0]}")
             raise
         finally:
-            self.trainee.close()
+            self.trainer.close()
             self.view.close()
 
-    def _preparing(self, what: str) -> None:
-        self.tell(what)
-        self._go("preparing", what)
+    def _preparing(self, line: str) -> None:
+        self.tell(line)
+        self._go("preparing", line)
 
     def _go(self, stage: str, note: str = "") -> None:
         self.stage, self.note = stage, note
         self.publish(self.status())
 
     def status(self) -> dict[str, Any]:
-        """What a page has to know to show the stage."""
-        sitting = self.sitting
+        """The message that shows the stage on a page."""
+        config = self.session_config
         more: dict[str, Any] = {}
         if self.stage == "consent":
-            more["text"] = sitting.consent
+            more["text"] = config.consent
         if self.stage == "questions":
-            more["questions"] = [dataclasses.asdict(question) for question in sitting.questions]
+            more["questions"] = [dataclasses.asdict(question) for question in config.questions]
         return {
             "kind": "status",
             "stage": self.stage,
             "note": self.note,
             "in_a_row": self.in_a_row,
-            "familiarisation": sitting.familiarisation,
+            "familiarisation": config.familiarisation,
             **more,
         }
 
     def about(self) -> dict[str, Any]:
-        """What a page has to know first."""
-        settings = self.trainee.settings
+        """The first message to a page."""
+        settings = self.trainer.settings
         return {
             "kind": "about",
             "env": settings.env,
             "algorithm": settings.algorithm,
-            "rate": self.sitting.rate,
+            "rate": self.session_config.rate,
             "total": settings.config.total_steps,
             "horizon": settings.config.prediction_horizon,
-            "actions": self.trainee.env.spec.action_size,
+            "actions": self.trainer.env.spec.action_size,
+            "drawing": self.view.drawing,
             "azimuth": self.view.azimuth,
-            "participant": self.sitting.participant,
+            "participant": self.session_config.participant,
         }
 
     def _ready(self) -> None:
         if not self._agreed:
             self._go("consent")
-        elif self.trainee.complete:
+        elif self.trainer.complete:
             self._finish()
-        elif self.in_a_row < self.sitting.familiarisation and self.trainee.steps == 0:
+        elif self.in_a_row < self.session_config.familiarisation and self.trainer.steps == 0:
             self._practise()
         else:
-            self._show(self.trainee.learner)
+            self._show(self.trainer.learner)
             self._go("ready")
 
     def _practise(self) -> None:
-        self._spare = self.trainee.spare()
+        self._spare = self.trainer.spare()
         self._show(self._spare)
         self.clock.start()
         self._go("practice")
 
     def _orders(self) -> None:
-        """Do what was asked; where the clock stands, wait for something."""
+        """Follow the orders so far; while the clock stands, wait for one."""
         standing = self.stage not in ("running", "practice")
         while True:
             try:
@@ -251,28 +218,28 @@ class Session:
         elif order == "practice" and stage in ("ready", "paused", "running"):
             self._practise()
         elif order == "restart" and stage in ("running", "paused"):
-            self.trainee.restart()
-            self._show(self.trainee.learner)
+            self.trainer.restart()
+            self._show(self.trainer.learner)
         elif order == "save" and stage in ("ready", "running", "paused"):
-            self.trainee.save()
+            self.trainer.save()
             self._go(stage, "saved")
 
     def _start(self) -> None:
-        if self.stage == "practice" and self.in_a_row < self.sitting.familiarisation:
+        if self.stage == "practice" and self.in_a_row < self.session_config.familiarisation:
             return  # not yet
         if self._spare is not None and self.stage == "paused" and self._to_practise():
             self._practise()
             return
         self._spare = None
-        self._show(self.trainee.learner)
+        self._show(self.trainer.learner)
         self.clock.start()
         self._go("running")
 
     def _to_practise(self) -> bool:
-        return self.in_a_row < self.sitting.familiarisation and self.trainee.steps == 0
+        return self.in_a_row < self.session_config.familiarisation and self.trainer.steps == 0
 
     def _consent(self, agreed: bool) -> None:
-        self._write(CONSENT, {"participant": self.sitting.participant, "agreed": agreed})
+        self._write(CONSENT, {"participant": self.session_config.participant, "agreed": agreed})
         if not agreed:
             self._stop()
             return
@@ -280,25 +247,25 @@ class Session:
         self._ready()
 
     def _answered(self, answers: dict[str, str | float]) -> None:
-        known = {question.name for question in self.sitting.questions}
+        known = {question.name for question in self.session_config.questions}
         kept = {name: answer for name, answer in answers.items() if name in known}
-        counters = self.trainee.learner.counters
+        counters = self.trainer.learner.counters
         self._write(
             ANSWERS,
-            {"step": self.trainee.steps, "episodes": int(counters.episodes), "answers": kept},
+            {"step": self.trainer.steps, "episodes": int(counters.episodes), "answers": kept},
         )
         self.clock.start()
         self._go("running")
 
     def _write(self, name: str, row: dict[str, Any]) -> None:
-        with open(self.trainee.folder.path / name, "a") as file:
+        with open(self.trainer.folder.path / name, "a") as file:
             file.write(json.dumps(row | {"time": round(time.time(), 3)}) + "\n")
 
     # a tick
 
     def _take(self) -> tuple[bool, np.ndarray, dict[str, Any]]:
-        """The person's hands now: in control, action, and how fresh that is."""
-        size, now = self.trainee.env.spec.action_size, time.monotonic()
+        """The person's input now: in control, action, and how old the input is."""
+        size, now = self.trainer.env.spec.action_size, time.monotonic()
         hands, fresh = self._hands, self._fresh
         self._fresh = False
         late = not fresh
@@ -323,34 +290,37 @@ class Session:
         self._tick_ms = 1000 * (time.monotonic() - began)
 
     def _training_tick(self, takeover: bool, action: np.ndarray, about: dict[str, Any]) -> None:
-        trainee = self.trainee
-        takeover = takeover or trainee.manual
-        mine = trainee.predict_path(trainee.learner, action).path if takeover else None
-        step = trainee.step(takeover, action, about)
-        self._show(trainee.learner, step, takeover, mine)
-        if trainee.fits_next:
-            self._go("preparing", "learning from what you have shown")
-            trainee.learn()
+        trainer = self.trainer
+        takeover = takeover or trainer.manual
+        mine = trainer.predict_path(trainer.learner, action).path if takeover else None
+        step = trainer.step(takeover, action, about)
+        self._show(trainer.learner, step, takeover=takeover, mine=mine)
+        if trainer.fits_next:
+            self._go("preparing", "learning from your demonstrations")
+            trainer.learn()
             self._go("running")
             self.clock.start()
         else:
-            trainee.learn()
-        if trainee.complete:
+            trainer.learn()
+        if trainer.complete:
             self._finish()
-        elif (step.terminated | step.truncated) and self.sitting.questions:
+        elif (step.terminated | step.truncated) and self.session_config.questions:
             self._go("questions")
 
     def _practice_tick(self, action: np.ndarray) -> None:
         assert self._spare is not None
-        mine = self.trainee.predict_path(self._spare, action).path
-        self._spare, step = self.trainee.practise(self._spare, True, action)
+        mine = self.trainer.predict_path(self._spare, action).path
+        self._spare, step = self.trainer.practise(self._spare, True, action)
         done = bool(step.terminated | step.truncated)
-        self._show(self._spare, step, True, mine)
+        self._show(self._spare, step, takeover=True, mine=mine)
         if not done:
             return
         self.in_a_row = self.in_a_row + 1 if bool(step.success) else 0
-        if self.sitting.familiarisation and self.in_a_row == self.sitting.familiarisation:
-            self._go("paused", f"{self.in_a_row} in a row: well done, now it counts")
+        if (
+            self.session_config.familiarisation
+            and self.in_a_row == self.session_config.familiarisation
+        ):
+            self._go("paused", f"{self.in_a_row} in a row, well done: from now on, steps count")
         else:
             self._go("practice")
 
@@ -358,18 +328,21 @@ class Session:
         self,
         learner: Learner,
         step: Interaction | None = None,
+        *,
         takeover: bool = False,
         mine: np.ndarray | None = None,
     ) -> None:
-        """Publish a frame, with the scene where it is another one."""
+        """Publish a frame, and the scene at the start of an episode."""
         state, counters = learner.env_state, learner.counters
         done = step is not None and bool(step.terminated | step.truncated)
         if done or step is None:
             mine = None
             self.publish({"kind": "scene"} | self.view.scene(state))
-        novice = None if self.stage == "practice" else self.trainee.ahead
+        novice = None if self.stage == "practice" else self.trainer.ahead
         shown = Shown(
-            None if novice is None else novice.path, novice is not None and novice.fails, mine
+            novice=None if novice is None else novice.path,
+            fails=novice is not None and novice.fails,
+            mine=mine,
         )
         self.frames += 1
         steps, human = int(counters.steps), int(counters.human_data)
@@ -389,7 +362,7 @@ class Session:
             "missed": self.clock.missed,
             "ticks": self.clock.ticks,
             "late": self.late,
-            "losses": {name: round(value, 4) for name, value in self.trainee.losses.items()},
+            "losses": {name: round(value, 4) for name, value in self.trainer.losses.items()},
             "ended": ended,
         }
         self._sent[self.frames] = time.monotonic()
@@ -402,7 +375,7 @@ class Session:
     def _figures(self) -> dict[str, Any]:
         ticks = max(self.clock.ticks, 1)
         return {
-            "participant": self.sitting.participant,
+            "participant": self.session_config.participant,
             "ticks": self.clock.ticks,
             "missed_ticks": self.clock.missed,
             "missed_share": round(self.clock.missed / ticks, 5),
@@ -410,10 +383,10 @@ class Session:
         }
 
     def _finish(self) -> None:
-        self._go("finished", "evaluating what it has learnt")
-        self.trainee.close()
-        scores = self.trainee.evaluate() if self.sitting.evaluate else {}
-        self.trainee.summary(scores, self._figures())
+        self._go("finished", "evaluating the policy")
+        self.trainer.close()
+        scores = self.trainer.evaluate() if self.session_config.evaluate else {}
+        self.trainer.summary(scores, self._figures())
         note = "complete"
         if scores:
             note = (
@@ -424,7 +397,7 @@ class Session:
         self.tell(note)
 
     def _stop(self) -> None:
-        self.trainee.close()
-        if self.trainee.steps:
-            self.trainee.summary({}, self._figures())
-        self._go("stopped", "saved: go on with --resume")
+        self.trainer.close()
+        if self.trainer.steps:
+            self.trainer.summary({}, self._figures())
+        self._go("stopped", "saved: continue with --resume")

@@ -1,8 +1,8 @@
-"""The policy that a person trains: stepped one by one, logged so that nothing is lost.
+"""A policy that a person trains step by step, with a log from which a crash can be undone.
 
 Every step a person makes is a line of session.jsonl before its effect is shown. A session that was
-killed is restored from its last checkpoint and the lines since, through the same programs: it goes
-on as if it had never stopped.
+killed is restored from its last checkpoint and the lines since, through the same programs: it
+continues as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from ppl_jax.live import make_live
 from ppl_jax.types import Env, Interaction, Trajectory
 
 LOG = "session.jsonl"
-SAVE_EVERY = 500  # steps between checkpoints; a resumed session makes so many again at most
+SAVE_EVERY = 500  # steps between checkpoints: the most that a resumed session has to repeat
 METRICS_EVERY = 100  # steps
 
-Told = Callable[[str], None]
-"""Called with a line that says what is being done."""
+Report = Callable[[str], None]
+"""`report(line)`: a line about the work in progress."""
 
 
 class InteractiveTrainer:
     """A session's learner with its programs, its log and its files.
 
     Attributes:
-        env: The world.
-        learner: All of the run's state.
+        env: The environment.
+        learner: The whole state of the run.
         events, steps: Lines of the log and steps so far.
-        losses: Of the last update that was looked at.
-        ahead: Where the novice was going when it was last looked at, every K steps; None before.
+        losses: Losses of a recent update (every tenth is read).
+        ahead: The novice's last predicted path, renewed every K steps; None before the first.
     """
 
     def __init__(
@@ -55,23 +55,26 @@ class InteractiveTrainer:
         folder: RunFolder,
         env: Env,
         place: Callable[[Any], jax.Array],
+        *,
         manual_episodes: int = 0,
     ):
         """Build, but compile nothing.
 
         Args:
-            settings: Of the run.
+            settings: The run's settings.
             folder: Its folder, open already.
-            env: Its world.
+            env: Its environment.
             place: `place(state) -> position [P]`.
-            manual_episodes: So many episodes at the start the person makes all by itself.
+            manual_episodes: Number of episodes at the start in which the person makes every step.
 
         Raises:
-            ValueError: If the method is one in which nobody is asked.
+            ValueError: If the method does not support a human.
         """
         self.settings, self.folder, self.env = settings, folder, env
         self.manual_episodes = manual_episodes
-        self.functions = make_live(env, algorithm_factory(settings, env), settings.config, place)
+        self.functions = make_live(
+            env, algorithm_factory(settings, env), settings.config, place=place
+        )
         if not self.functions.algorithm.supports_human:
             raise ValueError(
                 f"algorithm {settings.algorithm} asks nobody when to take over: choose ppl, pvp, "
@@ -80,7 +83,7 @@ class InteractiveTrainer:
         self.events = self.steps = 0
         self.losses: dict[str, float] = {}
         self.ahead: PredictedPath | None = None
-        self._since = 0  # steps of the episode
+        self._since = 0  # steps since the episode began
         self.recorder = Recorder(folder.path)
         self._file: Any = None
         self._writer: threading.Thread | None = None
@@ -88,10 +91,10 @@ class InteractiveTrainer:
         self._saved = 0
         self._began = time.perf_counter()
 
-    def prepare(self, tell: Told) -> None:
-        """Compile, and take up what the folder already holds."""
+    def prepare(self, report: Report) -> None:
+        """Compile, and restore the session that the folder already holds."""
         fns, config = self.functions, self.settings.config
-        tell("building the world")
+        report("building the environment")
         learner = jax.jit(fns.init)(jax.random.key(self.settings.seed), self.settings.hparams)
         action = jnp.zeros(self.env.spec.action_size)
         yes = jnp.ones((), bool)
@@ -100,31 +103,31 @@ class InteractiveTrainer:
             jitted = jax.jit(function, donate_argnums=0 if donate else ())
             return jitted.lower(*arguments).compile()
 
-        tell("compiling the look ahead")
-        self._foresee = compiled(fns.predict_path, learner, action, yes, donate=False)
-        tell("compiling the step")
+        report("compiling the prediction")
+        self._predict_path = compiled(fns.predict_path, learner, action, yes, donate=False)
+        report("compiling the step")
         self._play = compiled(fns.play, learner, yes, action)
         self._restart = compiled(fns.restart, learner)
-        tell("compiling the update")
+        report("compiling the update")
         self._learn = compiled(fns.learn, learner)
         self._fit: Callable | None = None
         if config.offline_updates:
             updates = config.offline_updates
             self._fit = compiled(lambda learner: fns.fit(learner, updates), learner)
         self.learner = learner
-        self._resume(tell)
+        self._resume(report)
         self._before = jax.tree.map(np.asarray, self.learner.counters)
         self._file = open(self.folder.path / LOG, "a", buffering=1)  # noqa: SIM115 - open all along
 
-    def _resume(self, tell: Told) -> None:
-        """Restore the last checkpoint and make the steps since again."""
+    def _resume(self, report: Report) -> None:
+        """Restore the last checkpoint and repeat the steps since."""
         lines = _whole_lines(self.folder.path / LOG)
         done, self.learner = restore_learner(self.folder, self.learner)
         self.events = self._saved = done
         self.steps = int(self.learner.counters.steps)
         self.recorder.rewind(done)
         if len(lines) > done:
-            tell(f"going over {len(lines) - done} steps again")
+            report(f"repeating {len(lines) - done} steps")
         for line in lines[done:]:
             self._apply(line)
         self.folder.rewind(self.steps, self.steps)
@@ -137,16 +140,16 @@ class InteractiveTrainer:
             self._make_update()
         self.events += 1
 
-    # what a session does with it
+    # used by a session
 
     @property
     def complete(self) -> bool:
-        """The run is as long as it was to be."""
+        """The run has all of its steps."""
         return self.steps >= self.settings.config.total_steps
 
     @property
     def manual(self) -> bool:
-        """The person makes every step for now."""
+        """The person makes every step at present."""
         return (
             self.steps < self.settings.config.demonstrations
             or int(self.learner.counters.episodes) < self.manual_episodes
@@ -154,25 +157,27 @@ class InteractiveTrainer:
 
     @property
     def fits_next(self) -> bool:
-        """The next `learn` makes the many updates on the demonstrations: it takes seconds."""
+        """The next `learn` makes the offline updates on the demonstrations: it takes seconds."""
         return self._fit is not None and self.steps == self.settings.config.demonstrations
 
     def predict_path(self, learner: Learner, action: np.ndarray) -> PredictedPath:
         """Where `action` leads if held."""
-        return predicted_path(self._foresee(learner, jnp.asarray(action), jnp.ones((), bool)))
+        return predicted_path(self._predict_path(learner, jnp.asarray(action), jnp.ones((), bool)))
 
     def _look_ahead(self) -> None:
         if self._since % self.settings.config.decision_interval == 0:
             nothing = jnp.zeros(self.env.spec.action_size)
-            self.ahead = predicted_path(self._foresee(self.learner, nothing, jnp.zeros((), bool)))
+            self.ahead = predicted_path(
+                self._predict_path(self.learner, nothing, jnp.zeros((), bool))
+            )
 
     def step(self, takeover: bool, action: np.ndarray, about: dict[str, Any]) -> Interaction:
-        """One step: logged, then made. `learn` comes after it.
+        """Log a step, then make it. Call `learn` after it.
 
         Args:
-            takeover: The person is in control (it is anyway while `manual`).
-            action: [A] of the person.
-            about: More for the log: times.
+            takeover: The person is in control; always so while `manual`.
+            action: [A] the person's action.
+            about: Further fields for the log, such as times.
         """
         takeover = takeover or self.manual
         action = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
@@ -196,7 +201,7 @@ class InteractiveTrainer:
         return step
 
     def learn(self) -> None:
-        """The update that follows a step; at the end of demonstrations, those on them."""
+        """The update that follows a step; after the demonstrations, the offline updates."""
         self._make_update()
         if self.steps % METRICS_EVERY == 0:
             self._log_metrics()
@@ -215,7 +220,7 @@ class InteractiveTrainer:
             self.losses = {name: float(np.mean(value)) for name, value in metrics.items()}
 
     def restart(self) -> None:
-        """Leave the episode unfinished and start another."""
+        """Leave the episode unfinished and start the next."""
         self._file.write(json.dumps({"do": "restart"}) + "\n")
         self._make_restart()
         self.events += 1
@@ -235,22 +240,22 @@ class InteractiveTrainer:
         self.folder.append_metrics(row | {"train/diverged": bool(self.learner.diverged)})
 
     def spare(self) -> Learner:
-        """A copy to practise with."""
+        """A copy of the learner to practise with."""
         return jax.tree.map(_copy, self.learner)
 
     def practise(
         self, learner: Learner, takeover: bool, action: np.ndarray
     ) -> tuple[Learner, Interaction]:
-        """A step that nothing is learnt from and nothing is kept of."""
+        """A step that teaches nothing and is not recorded."""
         return self._play(learner, jnp.asarray(takeover), jnp.asarray(action, jnp.float32))
 
     # files
 
     def save(self, wait: bool = False) -> None:
-        """Write a checkpoint, the policy and what was recorded, beside the session.
+        """Write a checkpoint, the policy and the recording, while the session continues.
 
         Raises:
-            OSError: If what was written before could not be; the log has every step all the same.
+            OSError: If the save before this one failed; the log still has every step.
         """
         self._join()
         self._saved = self.events
@@ -272,7 +277,7 @@ class InteractiveTrainer:
             self._join()
 
     def _join(self) -> None:
-        """Wait for the writer, and raise what went wrong there."""
+        """Wait for the writer, and raise the error that ended it."""
         if self._writer is not None:
             self._writer.join()
             self._writer = None
@@ -284,7 +289,7 @@ class InteractiveTrainer:
         return saved_policy(self.env, self.functions.algorithm.policy(learner.algorithm))
 
     def close(self) -> None:
-        """Save what is not saved yet and close the log."""
+        """Save the steps that are not saved yet and close the log."""
         if self._file is None:
             return
         self._file.close()
@@ -294,7 +299,7 @@ class InteractiveTrainer:
         self._join()
 
     def evaluate(self) -> dict[str, float]:
-        """Play every held-out scenario once without the person, and write it down."""
+        """Play every held-out scenario once without the person, and write the rows."""
         steps, human = self.steps, int(self.learner.counters.human_data)
         if steps not in {row.step for row in self._evaluated()}:
             rows = evaluate_policy(self.env, self._policy(self.learner), steps)
@@ -332,9 +337,9 @@ class InteractiveTrainer:
 
 
 def predicted_path(ahead: Trajectory) -> PredictedPath:
-    """A prediction as it is shown."""
+    """The part of a prediction that is shown."""
     bad = np.asarray(ahead.unsafe) | (np.asarray(ahead.terminated) & ~np.asarray(ahead.success))
-    return PredictedPath(np.asarray(ahead.position), bool(bad.any()))
+    return PredictedPath(path=np.asarray(ahead.position), fails=bool(bad.any()))
 
 
 def _copy(leaf: jax.Array) -> jax.Array:
@@ -344,7 +349,7 @@ def _copy(leaf: jax.Array) -> jax.Array:
 
 
 def _whole_lines(path: Path) -> list[dict[str, Any]]:
-    """The log's lines; one that was cut short is removed from the file."""
+    """The log's lines; an incomplete last one is removed from the file."""
     if not path.exists():
         return []
     content, lines, kept = path.read_bytes(), [], 0

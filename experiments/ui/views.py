@@ -1,4 +1,4 @@
-"""How each world is shown: driving as shapes that the page draws, the arms as rendered frames.
+"""How an environment is shown: roads as shapes that the page draws, arms as rendered pictures.
 
 A view's `scene(state)` is sent when an episode starts, `frame(state, shown)` in every step; both
 are JSON. A picture, where the view makes them, follows as JPEG when it is ready.
@@ -13,22 +13,60 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from ppl_jax.types import Env
 
-RATES = {"driving": 10.0, "table_wiping": 20.0, "nut_assembly": 20.0}  # Hz, of the worlds
 PICTURE = (480, 640)  # height and width
+
+
+class Display(NamedTuple):
+    """How an environment is shown.
+
+    Attributes:
+        drawing: "road" or "arm".
+        control_rate: Steps per second.
+    """
+
+    drawing: str
+    control_rate: float
+
+
+# the only place that names environments here; their cards (envs/cards.py) are to say it instead
+_DISPLAYS = {
+    "driving": Display(drawing="road", control_rate=10.0),
+    "table_wiping": Display(drawing="arm", control_rate=20.0),
+    "nut_assembly": Display(drawing="arm", control_rate=20.0),
+}
+_NEEDS = {"arm": (("mujoco", "manipulation"), ("PIL", "ui"))}  # drawing -> (module, extra)
+
+
+def display_of(env_name: str) -> Display:
+    """How an environment is shown; checked without building it.
+
+    Raises:
+        UserError: If it has no drawing, or a package for it is missing.
+    """
+    display = _DISPLAYS.get(env_name)
+    if display is None or display.drawing not in VIEWS:
+        raise UserError(
+            f"env: {env_name} has no drawing, so that it cannot be shown in a browser; those with "
+            f"one are {', '.join(_DISPLAYS)}"
+        )
+    for module, extra in _NEEDS.get(display.drawing, ()):
+        need(module, extra, f"showing {env_name}")
+    return display
 
 
 class Shown(NamedTuple):
     """Predicted paths to show, [H, P], or None.
 
     Attributes:
-        novice: Of the novice's held action, from where it was looked ahead.
+        novice: Path of the novice's held action, from the state where it was predicted.
         fails: It is predicted to fail.
-        mine: Of the person's held action, from here.
+        mine: Path of the person's held action, from the present state.
     """
 
     novice: np.ndarray | None = None
@@ -37,63 +75,65 @@ class Shown(NamedTuple):
 
 
 class View(Protocol):
-    """How a world is shown.
+    """Turns states of an environment into messages and pictures.
 
     Attributes:
-        azimuth: Direction of view in the plane of the table, degrees from x to y: what "away" means
-            to who looks. None where the first two actions are no such plane.
+        drawing: How the page draws it, a key of `VIEWS`.
+        azimuth: Direction of view in the plane of the table, degrees from x to y: "away" in the
+            picture. None where the first two actions are no such plane.
     """
 
-    azimuth: float | None
+    @property
+    def drawing(self) -> str: ...  # noqa: D102 - above
+
+    @property
+    def azimuth(self) -> float | None: ...  # noqa: D102 - above
 
     def place(self, state: Any) -> jax.Array:
-        """Where a state is, for predicted paths; pure."""
+        """Position of a state, for predicted paths; pure."""
         ...
 
     def scene(self, state: Any) -> dict[str, Any]:
-        """What stays for an episode."""
+        """The parts that stay for an episode."""
         ...
 
     def frame(self, state: Any, shown: Shown) -> dict[str, Any]:
-        """What changes."""
+        """The parts that change in every step."""
         ...
 
     def picture(self, number: int, state: Any, shown: Shown) -> None:
-        """Have a picture made, where the view makes any."""
+        """Order a picture, where the view makes any."""
         ...
 
     def close(self) -> None:
-        """Stop whatever makes pictures."""
+        """Stop the process that makes pictures, if any."""
         ...
 
 
 Picture = Callable[[int, bytes], None]
-"""`picture(frame's number, JPEG)`."""
+"""`picture(number of the frame, JPEG)`."""
 
 
 def make_view(env: Env, picture: Picture) -> View:
-    """The view of a world.
+    """The view of an environment.
 
     Raises:
-        UserError: If the world has none.
+        UserError: If it has none.
     """
-    if env.name == "driving":
-        return DrivingView(env)
-    if env.name in RATES:
-        return ArmView(env, picture)
-    raise UserError(f"{env.name} cannot be shown in a browser: choose {', '.join(RATES)}")
+    return VIEWS[display_of(env.name).drawing](env, picture)
 
 
 def _rounded(values: Any, digits: int = 2) -> list[Any]:
     return np.round(np.asarray(values, np.float64), digits).tolist()
 
 
-class DrivingView:
+class RoadView:
     """The road from above."""
 
-    azimuth = None
+    drawing, azimuth = "road", None
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Any, picture: Picture):
+        del picture  # the page draws
         self.env = env
 
     def place(self, state: Any) -> jax.Array:
@@ -101,11 +141,11 @@ class DrivingView:
         return state.ego.pose[:2]
 
     def scene(self, state: Any) -> dict[str, Any]:
-        """Road surfaces, the route's among them, lines and what stands there."""
+        """Road surfaces, the route's among them, lines and standing objects."""
         from envs.driving.rendering import CENTER_LINE, Scene
         from envs.driving.scenario import tree_index
 
-        self.scenario = tree_index(self.env.default_params.scenarios, int(state.scenario))
+        self.scenario = tree_index(self.env.default_params.scenarios, jnp.asarray(state.scenario))
         scene = Scene(self.scenario)
         scenario = scene.scenario
         lanes, objects = scenario.lanes, scenario.objects
@@ -164,6 +204,8 @@ def _end_of(surface: np.ndarray) -> np.ndarray:
 class ArmView:
     """The arm, rendered in a process of its own, which draws the newest state when it can."""
 
+    drawing = "arm"
+
     def __init__(self, env: Any, picture: Picture):
         self.env, self._picture = env, picture
         self.azimuth = env.card.camera["azimuth"]
@@ -210,14 +252,17 @@ class ArmView:
         self._pipe.close()
 
 
+VIEWS: dict[str, Callable[[Any, Picture], View]] = {"road": RoadView, "arm": ArmView}
+
+
 def _paint(pipe: Any, name: str) -> None:
     """Draw the newest state, again and again, until the other end is closed."""
     import signal
 
     from PIL import Image
 
-    from envs import make
     from envs.manipulation.rendering import ArmPaths, ArmScene
+    from envs.registry import make
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     scene = ArmScene(make(name), PICTURE, smooth=False)

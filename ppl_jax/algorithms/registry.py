@@ -166,7 +166,9 @@ def settings(
         assumed |= spec.tuned
     chosen = {"gate": TrainConfig().gate, "predictor": TrainConfig().predictor}
     chosen |= {k: v for k, v in (assumed | given).items() if k in chosen}
-    config = TrainConfig(**chosen, method=spec.config())
+    config = TrainConfig(
+        gate=chosen["gate"], predictor=chosen["predictor"], method=spec.config()
+    )
     hparams = HParams(
         method=spec.hparams(),
         gate=gate(chosen["gate"]).hparams(),

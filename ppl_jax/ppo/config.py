@@ -1,105 +1,204 @@
-"""Settings of PPO-Lagrangian: `PPOHParams` are traced, `PPOConfig` is static."""
+"""Settings of PPO-Lagrangian: `PPOHParams` are traced, `PPOConfig` is static.
+
+Every field says its own help, range and group (see `ppl_jax.fields`); `validate` reads them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import flax.struct
 import jax
 import numpy as np
 
+from ppl_jax.fields import About, about, setting
+
+POSITIVE = float(np.finfo(np.float32).tiny)  # least value of a field that must not be 0
+
+OLD_NAMES = {
+    "worlds": "num_envs",
+    "minibatches": "num_minibatches",
+    "smoothing": "gae_lambda",
+    "max_divergence": "target_kl",
+    "max_gradient": "max_grad_norm",
+    "entropy_weight": "entropy_coef",
+    "multiplier_rate": "lagrangian_lr",
+    "cost_ends": "terminate_on_cost",
+    "least_std": "min_std",
+}
+"""New names of settings, by the names in run folders and cards of earlier versions."""
+
 
 @flax.struct.dataclass
 class PPOHParams:
-    """Traced settings.
+    """Traced settings; each field has its help."""
 
-    Attributes:
-        learning_rate: Of Adam; it falls linearly to 0 over the run.
-        discount, cost_discount: gamma of the reward and of the cost. Where a rare episode costs
-            hundreds, a long horizon drowns the small costs that could be avoided.
-        gae_lambda: GAE's lambda, of both.
-        clip: e.
-        target_kl: Mean KL from the policy that played at which a batch's policy updates stop.
-        max_grad_norm: Norm to which gradients are clipped.
-        entropy_coef: Of the policy's entropy.
-        cost_limit: d, mean cost per episode.
-        terminate_on_cost: 1 where nothing is worth anything after a step that costs: for its advantages an
-            episode ends there (the early-terminated problem of Sun et al. 2021, "Safe Exploration
-            by Solving Early Terminated MDP"), though the world goes on. Then no kind of failure,
-            such as leaving the road, is a way out of a longer one. 0 leaves it as it is.
-        initial_multiplier, lagrangian_lr: lambda at the start, and Adam's rate for p.
-        initial_std, min_std: Of the actions, at the start and at least.
-        final_std: Bound on it at the end; from `initial_std` it moves there geometrically. Noise
-            that is clipped at the action box changes what a policy does on average, so that one
-            evaluated without noise had better have been trained with little of it.
-        success_bonus: Added to the reward in the step that solves the task, while training. Where
-            solving it ends the episode and a state shortly before pays every step, return alone
-            would have the policy loiter there.
-        demonstration_noise: Standard deviation of the noise under which the expert demonstrates.
-        guidance_weight: Of the distance from the expert's action, where the policy is guided.
-    """
-
-    learning_rate: jax.Array | float = 3e-4
-    discount: jax.Array | float = 0.99
-    cost_discount: jax.Array | float = 0.99
-    gae_lambda: jax.Array | float = 0.95
-    clip: jax.Array | float = 0.2
-    target_kl: jax.Array | float = 0.02
-    max_grad_norm: jax.Array | float = 0.5
-    entropy_coef: jax.Array | float = 0.0
-    cost_limit: jax.Array | float = 1.0
-    terminate_on_cost: jax.Array | float = 0.0
-    initial_multiplier: jax.Array | float = 1.0
-    lagrangian_lr: jax.Array | float = 0.01
-    initial_std: jax.Array | float = 0.5
-    min_std: jax.Array | float = 0.05
-    final_std: jax.Array | float = 1.0
-    success_bonus: jax.Array | float = 0.0
-    demonstration_noise: jax.Array | float = 0.3
-    guidance_weight: jax.Array | float = 1.0
+    learning_rate: jax.Array | float = setting(
+        0.0003,
+        "Learning rate of Adam; falls linearly to 0 over the run.",
+        low=0.0,
+        group="updates",
+        common=True,
+    )
+    discount: jax.Array | float = setting(
+        0.99, "gamma of the reward.", low=0.0, high=1.0, group="updates", common=True
+    )
+    cost_discount: jax.Array | float = setting(
+        0.99,
+        "gamma of the cost; a long horizon lets rare large costs hide small ones.",
+        low=0.0,
+        high=1.0,
+        group="cost",
+    )
+    gae_lambda: jax.Array | float = setting(
+        0.95,
+        "lambda of the generalised advantages, of reward and cost.",
+        low=0.0,
+        high=1.0,
+        group="updates",
+    )
+    clip: jax.Array | float = setting(
+        0.2, "PPO's bound on the probability ratio, around 1.", low=POSITIVE, group="updates"
+    )
+    target_kl: jax.Array | float = setting(
+        0.02,
+        "Mean KL from the acting policy at which a batch's policy updates stop.",
+        low=0.0,
+        group="updates",
+        common=True,
+    )
+    max_grad_norm: jax.Array | float = setting(
+        0.5, "Norm to which gradients are clipped.", low=POSITIVE, group="updates"
+    )
+    entropy_coef: jax.Array | float = setting(
+        0.0, "Weight of the policy's entropy.", low=0.0, group="updates"
+    )
+    cost_limit: jax.Array | float = setting(
+        1.0, "Mean cost per episode that is allowed.", low=0.0, group="cost", common=True
+    )
+    terminate_on_cost: jax.Array | float = setting(
+        0.0,
+        "1: a step with cost ends the episode for the advantages, though not in the environment.",
+        low=0.0,
+        high=1.0,
+        group="cost",
+    )
+    initial_multiplier: jax.Array | float = setting(
+        1.0, "Multiplier of the cost at the start.", low=POSITIVE, group="cost", common=True
+    )
+    lagrangian_lr: jax.Array | float = setting(
+        0.01, "Adam's learning rate for the multiplier.", low=0.0, group="cost", common=True
+    )
+    initial_std: jax.Array | float = setting(
+        0.5,
+        "Standard deviation of the actions at the start.",
+        low=POSITIVE,
+        group="policy",
+        common=True,
+    )
+    min_std: jax.Array | float = setting(
+        0.05, "Least standard deviation of the actions.", low=POSITIVE, group="policy"
+    )
+    final_std: jax.Array | float = setting(
+        1.0,
+        "Upper bound on the standard deviation of the actions at the end, reached geometrically.",
+        low=POSITIVE,
+        group="policy",
+    )
+    success_bonus: jax.Array | float = setting(
+        0.0,
+        "Reward added in the step that solves the task, while training.",
+        low=0.0,
+        group="updates",
+        common=True,
+    )
+    demonstration_noise: jax.Array | float = setting(
+        0.3,
+        "Standard deviation of the noise under which demonstrations are made.",
+        low=0.0,
+        group="demonstrations",
+    )
+    guidance_weight: jax.Array | float = setting(
+        1.0,
+        "Weight of the log-likelihood of the expert's actions, where guided.",
+        low=0.0,
+        group="demonstrations",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """What sets shapes and programs.
+    """Settings that shape arrays and programs; each field has its help."""
 
-    Attributes:
-        total_steps: Environment steps, rounded up to whole batches; demonstrations not counted.
-        worlds: Stepped side by side.
-        rollout_steps: Of each world per batch.
-        epochs, num_minibatches: Passes over a batch, and updates per pass.
-        hidden: Widths of the hidden layers of policy and critics.
-        scaling: Inputs are centred and scaled by running statistics of what was seen, or by the
-            world's constants.
-        demonstrations: Steps that an expert labels with what it would do, under noise, and that
-            the policy clones first.
-        demonstration_stride: Of so many steps of a world the one is kept at which the clone is
-            furthest from the expert: steps that follow each other look alike, and what a clone
-            lacks is situations.
-        demonstration_rounds: Into which these are split: the expert plays the first, the clone the
-            others.
-        cloning: Likelihood that is cloned (see `ppl_jax.distributions`): "laplace" goes for the
-            median of what the expert does in states that look alike, "gaussian" for the mean.
-        cloning_updates: Updates of that, over all rounds.
-        guided: The expert also says at every step of the training what it would do.
-        critic_batches: Batches at the start in which only the critics learn.
-    """
-
-    total_steps: int = 20_000_000
-    num_envs: int = 64
-    rollout_steps: int = 256
-    epochs: int = 5
-    num_minibatches: int = 8
-    hidden: tuple[int, ...] = (256, 256)
-    scaling: Literal["running", "world"] = "running"
-    demonstrations: int = 0
-    demonstration_stride: int = 1
-    demonstration_rounds: int = 1
-    cloning: Literal["laplace", "gaussian"] = "laplace"
-    cloning_updates: int = 20_000
-    guided: bool = False
-    critic_batches: int = 0
+    total_steps: int = setting(
+        20000000,
+        "Environment steps, rounded up to whole batches; demonstrations not counted.",
+        low=1,
+        group="run",
+        common=True,
+    )
+    num_envs: int = setting(
+        64, "Environments stepped side by side.", low=1, group="updates", common=True
+    )
+    rollout_steps: int = setting(
+        256, "Steps of each environment per batch.", low=1, group="updates", common=True
+    )
+    epochs: int = setting(5, "Passes over a batch.", low=1, group="updates", common=True)
+    num_minibatches: int = setting(
+        8, "Updates per pass over a batch.", low=1, group="updates", common=True
+    )
+    hidden: tuple[int, ...] = setting(
+        (256, 256),
+        "Widths of the hidden layers of policy and critics.",
+        group="policy",
+        common=True,
+    )
+    scaling: Literal["running", "world"] = setting(
+        "running",
+        "Inputs scaled by running statistics, or by the environment's constants.",
+        choices=("running", "world"),
+        group="policy",
+    )
+    demonstrations: int = setting(
+        0,
+        "Steps that the scripted expert labels under noise and that the policy clones first.",
+        low=0,
+        group="demonstrations",
+        common=True,
+    )
+    demonstration_stride: int = setting(
+        1,
+        "One step in this many is kept: where the clone is furthest from the expert.",
+        low=1,
+        group="demonstrations",
+    )
+    demonstration_rounds: int = setting(
+        1,
+        "Rounds of demonstrations: the expert acts in the first, the clone in the others.",
+        low=1,
+        group="demonstrations",
+    )
+    cloning: Literal["laplace", "gaussian"] = setting(
+        "laplace",
+        "Likelihood that is cloned: for the median or the mean of the expert's actions.",
+        choices=("laplace", "gaussian"),
+        group="demonstrations",
+    )
+    cloning_updates: int = setting(
+        20000, "Updates on the demonstrations, over all rounds.", low=0, group="demonstrations"
+    )
+    guided: bool = setting(
+        False,
+        "The expert labels every step of the training too.",
+        group="demonstrations",
+        common=True,
+    )
+    critic_batches: int = setting(
+        0, "Batches at the start in which only the critics learn.", low=0, group="updates"
+    )
 
     @property
     def batch_steps(self) -> int:
@@ -118,20 +217,10 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
     Raises:
         ValueError: One line naming field, value and what is allowed.
     """
-    for field in (
-        "total_steps",
-        "num_envs",
-        "rollout_steps",
-        "epochs",
-        "num_minibatches",
-        "demonstration_rounds",
-        "demonstration_stride",
-    ):
-        if getattr(config, field) < 1:
-            raise ValueError(f"{field} must be at least 1, got {getattr(config, field)}")
-    for field in ("demonstrations", "cloning_updates", "critic_batches"):
-        if getattr(config, field) < 0:
-            raise ValueError(f"{field} must not be negative, got {getattr(config, field)}")
+    for record in (config, hparams):
+        for field in dataclasses.fields(record):
+            if field.name != "hidden":
+                _check_range(field.name, getattr(record, field.name), about(field))
     if not config.hidden or min(config.hidden) < 1:
         raise ValueError(f"hidden must name at least one width of 1 or more, got {config.hidden}")
     if config.batch_steps % config.num_minibatches:
@@ -139,18 +228,44 @@ def validate(config: PPOConfig, hparams: PPOHParams) -> None:
             f"num_minibatches must divide num_envs x rollout_steps ({config.batch_steps}), got "
             f"{config.num_minibatches}"
         )
-    for name, value in dataclasses.asdict(hparams).items():
-        above = name in (
-            "initial_multiplier",
-            "initial_std",
-            "min_std",
-            "final_std",
-            "clip",
-            "max_grad_norm",
-        )
-        if not (value > 0 if above else value >= 0) or not np.isfinite(value):
-            what = "positive" if above else "a number of 0 or more"
-            raise ValueError(f"{name} must be {what}, got {value}")
-    for name in ("discount", "cost_discount", "gae_lambda", "terminate_on_cost"):
-        if getattr(hparams, name) > 1:
-            raise ValueError(f"{name} must lie between 0 and 1, got {getattr(hparams, name)}")
+
+
+def allowed(field: About, whole: bool) -> str:
+    """The values that a number may have, as the end of "must ..."."""
+    if field.high is not None:
+        return f"lie between {field.low:g} and {field.high:g}"
+    if field.low == POSITIVE:
+        return "be positive"
+    if not whole:
+        return f"be a number of {field.low:g} or more"
+    return f"be at least {field.low:g}" if field.low else "not be negative"
+
+
+def _check_range(name: str, value: Any, field: About) -> None:
+    if field.choices is not None:
+        if value not in field.choices:
+            raise ValueError(f"{name} must be one of {', '.join(field.choices)}, got {value!r}")
+        return
+    if field.low is None:
+        return
+    high = math.inf if field.high is None else field.high
+    if not math.isfinite(value) or not field.low <= value <= high:
+        raise ValueError(f"{name} must {allowed(field, isinstance(value, int))}, got {value}")
+
+
+def read(config: Mapping[str, Any], hparams: Mapping[str, Any]) -> tuple[PPOConfig, PPOHParams]:
+    """Settings from a run folder's config.json or a card, old names included.
+
+    Raises:
+        ValueError: One line naming what is unknown.
+    """
+    records = []
+    for kind, content in ((PPOConfig, config), (PPOHParams, hparams)):
+        known = {field.name for field in dataclasses.fields(kind)}
+        values = {OLD_NAMES.get(name, name): value for name, value in content.items()}
+        if unknown := sorted(set(values) - known):
+            raise ValueError(f"unknown settings of PPO-Lagrangian: {', '.join(unknown)}")
+        if "hidden" in values:
+            values["hidden"] = tuple(values["hidden"])
+        records.append(kind(**values))
+    return records[0], records[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -34,6 +35,7 @@ def advantages(
         terminated: The task ended there; done: or time was up.
         discount, gae_lambda: gamma and lambda.
     """
+    chex.assert_equal_shape([reward, value, next_value])
     delta = reward + discount * (1.0 - terminated) * next_value - value
 
     def step(following: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
@@ -51,6 +53,7 @@ def clipped_loss(
     clip: jax.Array | float = CLIP,
 ) -> jax.Array:
     """-E[min(rho A, clip(rho, 1 - e, 1 + e) A)], rho = pi / pi_old (Schulman et al. 2017)."""
+    chex.assert_equal_shape([log_prob, old_log_prob, advantage])
     ratio = jnp.exp(log_prob - old_log_prob)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     return -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))

@@ -39,7 +39,9 @@ def playing(out, *words):
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
     try:
-        address = next(m[0] for line in process.stdout if (m := re.search(r"http://\S+", line)))
+        address = next(
+            m[0] for line in process.stdout or () if (m := re.search(r"http://\S+", line))
+        )
         with playwright.sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1280, "height": 720})
@@ -66,7 +68,9 @@ def figure(page, name):
 
 
 def number(page, name):
-    return float(re.match(r"[-\d.]+", figure(page, name))[0])
+    found = re.match(r"[-\d.]+", figure(page, name))
+    assert found is not None
+    return float(found[0])
 
 
 def until(page, name, least):
@@ -123,7 +127,7 @@ def test_a_person_drives_with_keys_and_a_gamepad(tmp_path):
         page.wait_for_selector("#mapping button:text-is('button 3')")
         page.evaluate("press(3, 0)")
 
-        # the button that pauses goes on again
+        # the button that pauses continues again
         page.evaluate("press(9, 1)")
         page.wait_for_selector("#panel", state="hidden")
         page.evaluate("press(9, 0)")

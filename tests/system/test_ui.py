@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 import threading
 import time
 
@@ -20,7 +21,9 @@ from experiments.engine.recorded import length_of, recorded_functions
 from experiments.engine.run import RunSettings, open_folder, train
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
-from experiments.ui.play import play, read_consent, read_questions
+from experiments.ui import views
+from experiments.ui.config import Question, SessionConfig
+from experiments.ui.play import new_session, play, read_consent, read_questions, resumed
 from experiments.ui.protocol import (
     BURST,
     LONGEST,
@@ -34,7 +37,7 @@ from experiments.ui.protocol import (
     Seek,
     parse,
 )
-from experiments.ui.session import ANSWERS, CONSENT, Question, Session, SessionConfig
+from experiments.ui.session import ANSWERS, CONSENT, Session
 from experiments.ui.trainer import LOG, InteractiveTrainer
 from ppl_jax import algorithms, checkpoint
 from tests.helpers import Probe, plain_settings
@@ -58,7 +61,7 @@ PROBE = Probe()
 class ProbeView:
     """Shows what the observation shows."""
 
-    azimuth = None
+    drawing, azimuth = "", None
 
     def __init__(self):
         self.pictures = 0
@@ -79,7 +82,7 @@ class ProbeView:
         pass
 
 
-def trainee(folder, resume=False, settings=SETTINGS, **more):
+def trainer(folder, resume=False, settings=SETTINGS, **more):
     run = RunFolder(folder)
     open_folder(run, settings.as_json(), resume)
     made = InteractiveTrainer(settings, run, PROBE, ProbeView().place, **more)
@@ -90,13 +93,17 @@ def trainee(folder, resume=False, settings=SETTINGS, **more):
 class Person:
     """Takes over where the page says that it is predicted to fail, and knows the answer."""
 
-    def __init__(self, folder, sitting=None, settings=SETTINGS, resume=False, **more):
+    def __init__(self, folder, session_config=None, settings=SETTINGS, resume=False, **more):
         run = RunFolder(folder)
         open_folder(run, settings.as_json(), resume)
         made = InteractiveTrainer(settings, run, PROBE, ProbeView().place, **more)
         self.frames, self.stages, self.told = [], [], []
         self.session = Session(
-            made, ProbeView(), sitting or SessionConfig(rate=1000.0), self.see, self.told.append
+            made,
+            ProbeView(),
+            session_config or SessionConfig(rate=1000.0),
+            self.see,
+            tell=self.told.append,
         )
         self.always = False
 
@@ -152,14 +159,14 @@ def test_a_person_teaches_the_probe_world(tmp_path):
 
 
 def test_consent_familiarisation_manual_episodes_and_questions(tmp_path):
-    sitting = SessionConfig(
+    session_config = SessionConfig(
         rate=1000.0,
         participant="p-01",
         consent="We record what you do.",
         familiarisation=2,
         questions=(Question("load", "How hard was it?", ("easy", "hard")),),
     )
-    person = Person(tmp_path / "run", sitting, manual_episodes=1)
+    person = Person(tmp_path / "run", session_config, manual_episodes=1)
     person.session.run()
     assert person.stages[:7] == [
         "preparing",
@@ -204,9 +211,9 @@ def drive(made, steps, first=0):
 
 
 def test_a_killed_session_goes_on_as_if_it_had_never_stopped(tmp_path):
-    whole = trainee(tmp_path / "whole")
+    whole = trainer(tmp_path / "whole")
     drive(whole, 120)
-    broken = trainee(tmp_path / "broken")
+    broken = trainer(tmp_path / "broken")
     drive(broken, 50)
     broken.save(wait=True)
     drive(broken, 55, 50)
@@ -214,7 +221,7 @@ def test_a_killed_session_goes_on_as_if_it_had_never_stopped(tmp_path):
     # killed: what is in memory is gone, the line being written is cut short
     with open(tmp_path / "broken" / LOG, "a") as file:
         file.write('{"do": "step", "takeo')
-    again = trainee(tmp_path / "broken", resume=True)
+    again = trainer(tmp_path / "broken", resume=True)
     assert again.steps == 105
     drive(again, 15, 105)
     equal(again.learner, whole.learner)
@@ -227,10 +234,10 @@ def test_a_killed_session_goes_on_as_if_it_had_never_stopped(tmp_path):
 
 
 def test_a_session_whose_first_checkpoint_never_came_goes_on(tmp_path):
-    broken = trainee(tmp_path / "run")
+    broken = trainer(tmp_path / "run")
     drive(broken, 40)
     broken._file.close()
-    again = trainee(tmp_path / "run", resume=True)
+    again = trainer(tmp_path / "run", resume=True)
     assert again.steps == 40
     equal(again.learner, broken.learner)
     again.close()
@@ -259,12 +266,12 @@ def test_a_page_that_leaves_pauses_and_stale_hands_are_off(tmp_path):
     wait_for(lambda: len(person.frames) > 10)
     person.session.left()
     wait_for(lambda: person.session.stage == "paused")
-    steps = person.session.trainee.steps
+    steps = person.session.trainer.steps
     time.sleep(0.2)
-    assert person.session.trainee.steps == steps  # the clock stands
+    assert person.session.trainer.steps == steps  # the clock stands
     person.session.receive = lambda message: None  # a page that says nothing more
     Session.receive(person.session, Order("start"))
-    wait_for(lambda: person.session.trainee.steps > steps + 40)
+    wait_for(lambda: person.session.trainer.steps > steps + 40)
     assert not person.frames[-1]["takeover"]
     assert person.session.late > 20
     Session.receive(person.session, Order("quit"))
@@ -293,7 +300,7 @@ def test_a_method_that_starts_with_demonstrations(tmp_path):
 
 
 def test_a_full_disk_ends_the_session_and_loses_nothing(tmp_path, monkeypatch):
-    made = trainee(tmp_path / "run")
+    made = trainer(tmp_path / "run")
     drive(made, 30)
 
     def full(*_):
@@ -303,7 +310,7 @@ def test_a_full_disk_ends_the_session_and_loses_nothing(tmp_path, monkeypatch):
         patched.setattr(checkpoint, "save", full)
         with pytest.raises(OSError, match="no space left"):
             made.close()
-    again = trainee(tmp_path / "run", resume=True)
+    again = trainer(tmp_path / "run", resume=True)
     equal(again.learner, made.learner)
     again.close()
 
@@ -311,14 +318,14 @@ def test_a_full_disk_ends_the_session_and_loses_nothing(tmp_path, monkeypatch):
 def test_methods_that_ask_nobody_are_refused(tmp_path):
     settings = dataclasses.replace(SETTINGS, algorithm="bc")
     with pytest.raises(ValueError, match="asks nobody when to take over"):
-        trainee(tmp_path / "run", settings=settings)
+        trainer(tmp_path / "run", settings=settings)
 
 
 # the recording
 
 
 def test_an_exported_session_is_the_session(tmp_path):
-    made = trainee(tmp_path / "run")
+    made = trainer(tmp_path / "run")
     drive(made, 60)
     made.close()
     assert recording.export(tmp_path / "run", tmp_path / "session.npz") == 60
@@ -339,7 +346,7 @@ def test_bad_recordings_are_told_in_a_line(tmp_path):
     junk.write_bytes(b"no zip")
     with pytest.raises(UserError, match="cannot be read"):
         recording.load(junk)
-    made = trainee(tmp_path / "run")
+    made = trainer(tmp_path / "run")
     with pytest.raises(UserError, match="has no recording"):
         recording.load(tmp_path / "run")
     drive(made, 20)
@@ -432,7 +439,26 @@ def test_messages_are_understood(content, message):
     ],
 )
 def test_malformed_messages_are_refused(text):
-    with pytest.raises(Malformed):
+    with pytest.raises(Malformed) as refusal:
+        parse(text, 2)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("{", "not JSON"),
+        ('{"kind": "order", "order": "rm"}', "order must be one of start, pause"),
+        ('{"kind": "seek", "step": -1}', "step must be the number of a step"),
+        ('{"kind": "consent", "agreed": 1}', "agreed must be true or false"),
+        ('{"kind": "dance"}', "kind must be input, order, consent, answers or seek"),
+        ('{"kind": "consent", "agreed": true, "more": 1}', "unknown field `more`"),
+        ('{"kind": "consent"}', "required field `agreed`"),
+        ('{"kind": "input", "seen": 1, "takeover": true, "action": [0]}', "action must be 2"),
+    ],
+)
+def test_a_refusal_names_the_field_and_what_is_allowed(text, line):
+    with pytest.raises(Malformed, match=line):
         parse(text, 2)
 
 
@@ -520,24 +546,25 @@ def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "sitting", "more", "line"),
+    ("changes", "session", "more", "line"),
     [
         ({"env": "moon"}, {}, {}, "unknown environment 'moon'"),
         ({"algorithm": "ppo"}, {}, {}, "unknown algorithm 'ppo'"),
         ({"seed": -1}, {}, {}, "seed must not be negative, got -1"),
         ({}, {"participant": "a b"}, {}, "participant must be at most 32 letters"),
         ({}, {"familiarisation": -1}, {}, "familiarisation must not be negative, got -1"),
-        ({}, {}, {"manual_episodes": -2}, "manual_episodes must not be negative, got -2"),
+        ({}, {"manual_episodes": -2}, {}, "manual_episodes must not be negative, got -2"),
+        ({}, {"rate": 0.0}, {}, "rate must lie between 0.1 and 1000, got 0.0"),
         ({}, {}, {"host": "0.0.0.0"}, "host must be one of 127.0.0.1"),
         ({}, {}, {"port": 70000}, "port: cannot listen on 127.0.0.1:70000"),
     ],
 )
 def test_bad_input_is_told_in_a_line_before_anything_is_built(
-    tmp_path, changes, sitting, more, line
+    tmp_path, changes, session, more, line
 ):
     settings = dataclasses.replace(SETTINGS, **({"env": "driving"} | changes))
     with pytest.raises(UserError, match=line):
-        play(settings, tmp_path / "run", False, SessionConfig(rate=10.0, **sitting), **more)
+        play(settings, tmp_path / "run", SessionConfig(**{"rate": 10.0} | session), **more)
     assert not (tmp_path / "run").exists()
 
 
@@ -557,3 +584,59 @@ def test_consent_and_questions_are_read_and_checked(tmp_path):
     file.write_text('[{"name": "load", "text": "How?"}, {"name": "load", "text": "Why?"}]')
     with pytest.raises(UserError, match="a name of its own"):
         read_questions(file)
+
+
+# settings that come from the folder
+
+
+def test_a_session_resumes_with_the_settings_of_its_folder(tmp_path):
+    settings = dataclasses.replace(SETTINGS, env="driving")
+    questions = (Question(name="load", text="How?", choices=("a", "b")),)
+    given = {"participant": "p1", "rate": 5.0, "questions": questions, "seed": 0}
+    made = new_session("driving", given | {"beta": 0.1})
+    assert made == SessionConfig(rate=5.0, participant="p1", questions=questions)
+    open_folder(RunFolder(tmp_path), settings.as_json() | made.as_json(), False)
+    assert resumed(tmp_path, {}) == (settings, made)
+    assert resumed(tmp_path, given | {"env": "driving", "learning_rate": 3e-3}) == (settings, made)
+    with pytest.raises(UserError) as refusal:
+        resumed(tmp_path, {"participant": "p2", "seed": 3, "total_steps": 300})
+    assert str(refusal.value) == (
+        f"cannot resume {str(tmp_path)!r}: its participant is 'p1', asked for 'p2'; its seed is 0, "
+        "asked for 3"
+    )
+
+
+def test_sessions_of_older_versions_resume(tmp_path):
+    settings = dataclasses.replace(SETTINGS, env="driving")
+    before = settings.as_json() | {"participant": "p1", "manual_episodes": 2}
+    open_folder(RunFolder(tmp_path), before, False)
+    expected = SessionConfig(rate=10.0, participant="p1", manual_episodes=2)
+    assert resumed(tmp_path, {}) == (settings, expected)
+
+
+def test_a_folder_without_a_session_is_not_resumed(tmp_path):
+    with pytest.raises(UserError, match="not a run folder"):
+        resumed(tmp_path, {})
+    open_folder(
+        RunFolder(tmp_path), dataclasses.replace(SETTINGS, expert="scripted").as_json(), False
+    )
+    with pytest.raises(UserError, match="its expert is 'scripted'; use ppl train --resume"):
+        resumed(tmp_path, {})
+
+
+# how an environment is shown
+
+
+def test_an_environment_without_a_drawing_is_one_line():
+    with pytest.raises(UserError, match="env: probe has no drawing") as refusal:
+        views.display_of("probe")
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_missing_package_is_one_line_with_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(UserError) as refusal:
+        views.display_of("table_wiping")
+    assert str(refusal.value) == (
+        "showing table_wiping needs mujoco: pip install 'ppl-jax[manipulation]'"
+    )

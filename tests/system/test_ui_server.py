@@ -12,6 +12,7 @@ pytest.importorskip("uvicorn")
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from experiments.engine.runtime import UserError
 from experiments.ui.protocol import Input, Order
@@ -19,7 +20,7 @@ from experiments.ui.server import COOKIE, Hub, listen, serve
 
 
 class Echo:
-    """A performance that only notes what it is told."""
+    """A backend that only notes its messages."""
 
     lingers = False
 
@@ -48,13 +49,22 @@ class Echo:
         return {"kind": "status", "stage": "running"}
 
 
+class Broken(Echo):
+    """A backend that fails."""
+
+    def run(self):
+        raise ZeroDivisionError
+
+
 class Served:
     def __init__(self):
         self.echo, self.hub, self.told = Echo(), Hub(2), []
         self.socket = listen("127.0.0.1", 0, exposed=False)
         self.port = self.socket.getsockname()[1]
         self.thread = threading.Thread(
-            target=serve, args=(self.hub, self.echo, self.socket, False, self.told.append)
+            target=serve,
+            args=(self.hub, self.echo, self.socket),
+            kwargs={"tell": self.told.append},
         )
 
     @property
@@ -78,7 +88,7 @@ class Served:
     def page(self, cookie, origin=None):
         return connect(
             f"ws://127.0.0.1:{self.port}/talk",
-            origin=origin or f"http://127.0.0.1:{self.port}",
+            origin=Origin(origin or f"http://127.0.0.1:{self.port}"),
             additional_headers={"Cookie": cookie},
         )
 
@@ -224,8 +234,7 @@ def test_only_this_machine_unless_asked_for():
             listen("127.0.0.1", port, exposed=False)
 
 
-def test_a_performance_that_breaks_ends_the_server():
-    hub, echo = Hub(2), Echo()
-    echo.run = lambda: 1 / 0
+def test_a_backend_that_breaks_ends_the_server():
+    hub, echo = Hub(2), Broken()
     with listen("127.0.0.1", 0, exposed=False) as socket, pytest.raises(ZeroDivisionError):
         serve(hub, echo, socket, tell=lambda line: None)

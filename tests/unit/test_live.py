@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +29,7 @@ def small(algorithm="ppl", **changes):
 
 
 CONFIG, HP = small()
+NO_KEY: Any = None  # acting without noise needs none
 
 
 def live(algorithm="ppl", **changes):
@@ -75,7 +78,7 @@ def test_a_session_teaches_and_its_recording_teaches_the_same(algorithm):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
     if algorithm == "ppl":
         for sign in (1.0, -1.0):
-            action = fns.algorithm.act(learner.algorithm, None, jnp.array([sign, 0.0, 1.0]))
+            action = fns.algorithm.act(learner.algorithm, NO_KEY, jnp.array([sign, 0.0, 1.0]))
             assert float(action[0]) == pytest.approx(0.6 * sign, abs=probe.tolerance)
 
 
@@ -84,7 +87,7 @@ def test_whose_action_is_executed_and_stored():
     learner = fns.init(jax.random.key(0), HP)
     mine, novices = (
         jnp.array([0.3]),
-        fns.algorithm.act(learner.algorithm, None, jnp.array([learner.env_state.sign, 0.0, 1.0])),
+        fns.algorithm.act(learner.algorithm, NO_KEY, jnp.array([learner.env_state.sign, 0.0, 1.0])),
     )
     taken, row = fns.play(learner, jnp.array(True), 5 * mine)
     np.testing.assert_allclose(row.executed_action, [1.0])  # clipped
@@ -100,7 +103,7 @@ def test_whose_action_is_executed_and_stored():
     assert bool(row.takeover_start)
 
 
-def test_foresight_leaves_no_trace_and_is_what_then_happens():
+def test_a_predicted_path_leaves_no_trace_and_is_what_then_happens():
     _, fns = live()
     learner = fns.init(jax.random.key(0), HP)
     for mine in (True, False):
@@ -110,7 +113,7 @@ def test_foresight_leaves_no_trace_and_is_what_then_happens():
             action
             if mine
             else fns.algorithm.act(
-                learner.algorithm, None, jnp.array([learner.env_state.sign, 0.0, 1.0])
+                learner.algorithm, NO_KEY, jnp.array([learner.env_state.sign, 0.0, 1.0])
             )
         )
         state = learner
@@ -118,6 +121,7 @@ def test_foresight_leaves_no_trace_and_is_what_then_happens():
             state, row = fns.play(state, jnp.array(True), held)
             if not bool(ahead.valid[k]):
                 break
+            assert ahead.position is not None
             assert bool(ahead.unsafe[k]) == bool(row.cost > 0)
             if not bool(row.terminated):
                 assert float(ahead.position[k, 0]) == pytest.approx(

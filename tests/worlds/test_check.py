@@ -12,7 +12,7 @@ import pytest
 import envs
 from envs.check import check_env
 from envs.registry import unknown
-from ppl_jax.predictors import selected_transition
+from ppl_jax.predictors import predictor
 from ppl_jax.types import EnvSpec
 from tests.helpers import ROOT, Aim, Balance, Endless, Goal, Probe, Spend, Toll, TwoSteps
 
@@ -168,7 +168,7 @@ def test_defaults_of_the_base_class():
     key = jax.random.key(0)
     assert probe.readings(probe.reset_to(jnp.int32(0), key, probe.default_params)) == []
     with pytest.raises(ValueError, match="no predictor 'kinematic': choose one of simulator"):
-        selected_transition(probe, "kinematic")
+        predictor("kinematic").make(probe)
 
 
 def test_names():

@@ -1,6 +1,6 @@
-// What the person's hands do: keyboard and gamepad, both at once.
+// The person's controls: keyboard and gamepad, both at once.
 
-const RAMP = { press: 4, release: 7 }; // per second: a key is no lever, so it moves one
+const RAMP = { press: 4, release: 7 }; // per second: a key moves a lever instead of being one
 const DEAD = 0.12; // of a stick
 const SLOW = 0.4; // of the arm's full speed, 0.3 m/s: too fast for keys near a peg
 
@@ -21,13 +21,13 @@ const GRIPPER = 6;
 // function -> gamepad button or axis of the Xbox layout
 const DRIVING_PAD = {
   "take over": { button: 5 }, "throttle": { button: 7 }, "brake": { button: 6 },
-  "steer": { axis: 0, sign: -1 }, "pause, go on": { button: 9 },
+  "steer": { axis: 0, sign: -1 }, "pause, continue": { button: 9 },
 };
 const ARM_PAD = {
   "take over": { button: 5 }, "away": { axis: 1, sign: -1 }, "left": { axis: 0, sign: -1 },
   "up": { axis: 3, sign: -1 }, "turn": { axis: 2, sign: -1 },
   "tilt +": { button: 12 }, "tilt -": { button: 13 }, "roll +": { button: 14 }, "roll -": { button: 15 },
-  "gripper": { button: 2 }, "pause, go on": { button: 9 },
+  "gripper": { button: 2 }, "pause, continue": { button: 9 },
 };
 const FAST = ["ShiftLeft", "ShiftRight"];
 const NAMES = {
@@ -43,7 +43,7 @@ export class Hands {
     this.azimuth = (about.azimuth ?? 0) * Math.PI / 180;
     this.changed = changed;
     this.order = order;
-    this.arm = about.env !== "driving";
+    this.arm = about.drawing === "arm";
     this.bindings = (this.arm ? ARM : DRIVING).filter(([, , axis]) => axis < this.size);
     this.storage = "ppl-pad-" + (this.arm ? "arm" : "driving");
     this.pad = { ...(this.arm ? ARM_PAD : DRIVING_PAD) };
@@ -137,7 +137,7 @@ export class Hands {
     return { takeover: held, action: action.map((part) => Math.max(-1, Math.min(1, part))) };
   }
 
-  #turn(action) { // away from who looks is some way across the table
+  #turn(action) { // "away" in the picture is some direction in the plane of the table
     const [away, left] = action, c = Math.cos(this.azimuth), s = Math.sin(this.azimuth);
     action[0] = c * away - s * left;
     action[1] = s * away + c * left;
@@ -155,13 +155,13 @@ export class Hands {
       action[1] += read("throttle") - read("brake");
     }
     if (this.#pressed(pad, "take over") && this.toggles) this.toggled = !this.toggled;
-    if (this.#pressed(pad, "pause, go on")) this.order("pause");
+    if (this.#pressed(pad, "pause, continue")) this.order("pause");
   }
 
-  standing() { // the clock stands: the button that stopped it starts it
+  standing() { // while the clock stands, the pause button starts it
     const pad = this.gamepad();
     if (pad && this.listening) this.#choose(pad);
-    else if (pad && this.#pressed(pad, "pause, go on")) this.order("start");
+    else if (pad && this.#pressed(pad, "pause, continue")) this.order("start");
   }
 
   release() { this.toggled = false; this.down.clear(); }

@@ -28,7 +28,7 @@ function connect() {
   };
   socket.onclose = () => {
     if (over) return;
-    status = { stage: "connecting", note: "the connection is lost; trying again" };
+    status = { stage: "connecting", note: "connection lost; trying again" };
     render();
     setTimeout(connect, 1000);
   };
@@ -46,9 +46,9 @@ const RECEIVE = {
   about(message) {
     about = message;
     if (!hands) { hands = new Hands(about, hand, order); keys(); }
-    $("title").textContent = `${about.env.replace("_", " ")} \u00b7 ${about.algorithm}` + (about.participant ? ` \u00b7 ${about.participant}` : "");
+    $("title").textContent = `${about.env.replaceAll("_", " ")} \u00b7 ${about.algorithm}` + (about.participant ? ` \u00b7 ${about.participant}` : "");
     document.title = `ppl play ${about.env}`;
-    $("road").hidden = about.env !== "driving";
+    $("road").hidden = about.drawing !== "road";
     $("seeking").hidden = !about.replay;
     $("controls").hidden = Boolean(about.replay);
     $("seek").max = about.total - 1;
@@ -65,7 +65,7 @@ const RECEIVE = {
   frame(message) {
     frame = message;
     hand();
-    if (about.env === "driving") { road.frame = message; road.draw(); }
+    if (about.drawing === "road") { road.frame = message; road.draw(); }
     const loss = Object.entries(message.losses);
     if (loss.length && message.step % 10 === 0) losses.push(Object.fromEntries(loss));
     if (losses.length > 600) losses.shift();
@@ -109,7 +109,7 @@ function figures() {
   }));
   const going = status.stage === "running" || practice || about.replay;
   const who = $("who"), forecast = $("forecast");
-  who.textContent = !going ? status.stage : practice ? "practice: you drive, nothing is learnt" :
+  who.textContent = !going ? status.stage : practice ? "practice: you drive, and nothing is learnt" :
     f.takeover ? (about.replay ? "the person is in control" : "YOU are in control") : "the novice is in control";
   who.className = going && f.takeover ? "mine" : "";
   const shown = going && !practice && f.novice !== null;
@@ -136,7 +136,7 @@ function drawLoss() {
   $("lossnote").textContent = `training loss (${name.replace("loss_", "")}): ${values[values.length - 1].toFixed(3)}`;
 }
 
-const BUTTONS = [ // name, what it says, its key, stages in which it works
+const BUTTONS = [ // name, label, key, stages in which it works
   ["start", "Start", "Enter", ["ready", "paused", "practice"]],
   ["pause", "Pause", "KeyP", ["running", "practice"]],
   ["restart", "Restart", "Backspace", ["running", "paused"]],
@@ -190,7 +190,7 @@ function button(label, action, main = false) {
 
 const HEADINGS = {
   connecting: "Connecting", preparing: "Getting ready", consent: "Before we start", ready: "Ready",
-  paused: "Paused", questions: "A few questions", finished: "Done", stopped: "Saved", failed: "Something broke",
+  paused: "Paused", questions: "A few questions", finished: "Done", stopped: "Saved", failed: "An error ended the session",
 };
 
 let drawn = "";
@@ -203,7 +203,7 @@ function panel() {
   if (form.hidden) { $("road").focus(); return; }
   const parts = [text("h2", HEADINGS[stage])];
   if (status.note) parts.push(text("p", status.note));
-  if (stage === "preparing") parts.push(text("p", "The clock does not run yet."));
+  if (stage === "preparing") parts.push(text("p", "The clock is not running yet."));
   if (stage === "ready" || stage === "paused") parts.push(text("p", introduction()), button("Start (Enter)", () => order("start"), true));
   if (stage === "consent") {
     parts.push(text("pre", status.text),
@@ -217,11 +217,11 @@ function panel() {
 }
 
 function introduction() {
-  const names = about?.env === "driving" ? "the car" : "the arm";
+  const names = about?.drawing === "road" ? "the car" : "the arm";
   const how = hands?.toggles ? "press" : "hold";
-  return `The novice moves ${names} and shows where it is going: a green line with dots where that is ` +
-    `fine, a red dashed one with a cross where it is predicted to fail. To take over, ${how} Space ` +
-    "and steer; your own path is blue. Every time you take over it learns.";
+  return `The novice moves ${names}, and its predicted path is drawn ahead: green with dots if it is ` +
+    `safe, red, dashed and with a cross if it is predicted to fail. To take over, ${how} Space and ` +
+    "steer; your own path is blue. The novice learns from every takeover.";
 }
 
 function questions(form) {
@@ -245,7 +245,7 @@ function questions(form) {
   }
   const done = () => send({ kind: "answers", answers: Object.fromEntries(new FormData(form)) });
   form.onsubmit = (event) => { event.preventDefault(); done(); };
-  parts.push(button("Go on", done, true));
+  parts.push(button("Continue", done, true));
   return parts;
 }
 
@@ -287,7 +287,7 @@ function pads() {
 
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.target.matches?.("input[type=text], textarea")) return;
-  if (event.code === "Enter" && event.target.matches?.("button, summary, input")) return; // it presses that
+  if (event.code === "Enter" && event.target.matches?.("button, summary, input")) return; // Enter presses the focused element
   const found = BUTTONS.find(([, , key]) => key === event.code) ?? (event.code === "Escape" ? BUTTONS[1] : null);
   if (!found || $(`do-${found[0]}`)?.disabled) return;
   event.preventDefault();
