@@ -25,8 +25,8 @@ class Algorithm(NamedTuple):
         name: As in results.
         init: `init(key) -> state`, a struct with buffers and a field `learned` that holds all
             that updates change.
-        act: `act(state, key, observation [O]) -> action [A]`, what the novice does while training.
-            It is clipped to [-1, 1] before it is executed.
+        act: `act(state, key, observation [O]) -> action [A]`, the novice's while training. It is
+            clipped to [-1, 1] before it is executed.
         decide: `decide(state, point, hparams) -> bool`, whether the expert takes over for the next
             block of steps; None leaves it to the gate that the configuration names.
         store: `store(state, interaction, hparams) -> state`.
@@ -72,11 +72,11 @@ class Learned:
 
     Attributes:
         params: They act while training.
-        opt_state: Of Adam.
+        opt_state: State of Adam.
         updates: Number of updates so far.
-        average: Moving average of `params`. Of a policy over the last thousand or so updates: what
-            is evaluated, saved and exported (one update per step on changing data leaves the last
-            parameters noisy). Of a critic: its target network.
+        average: Moving average of `params`. A policy's, over the last thousand or so updates, is
+            evaluated, saved and exported (one update per step on changing data leaves the last
+            parameters noisy). A critic's is its target network.
     """
 
     params: PyTree
@@ -108,7 +108,7 @@ def adam_step(
     Args:
         learned: Before.
         grads: Like `learned.params`.
-        learning_rate: Of Adam.
+        learning_rate: Step size.
         do: Scalar.
         polyak_tau: tau of a target network: average <- (1 - tau) average + tau params. Where None
             the average is a policy's, with `AVERAGING` for decay.

@@ -102,8 +102,8 @@ def make_cloner(
         L = -E_{D_h}[ log pi(a_h|s) ]
 
     Args:
-        name: Of the method.
-        spec: Of the environment.
+        name: The method's name.
+        spec: The environment's sizes and scales.
         config: Static settings.
         decide: See `Algorithm.decide`.
     """

@@ -98,10 +98,10 @@ def members_loss(
     """Sum of the members' cloning losses, each on a batch of its own.
 
     Args:
-        params: Of the ensemble.
+        params: The ensemble's.
         observation, action: [K, B, O], [K, B, A].
         weight: [K, B].
-        ensemble: Of K members.
+        ensemble: K members.
         config: Static settings.
     """
     mean = ensemble.each(params, observation)

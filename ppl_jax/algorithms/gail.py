@@ -78,8 +78,8 @@ class GAILLearned:
 
     Attributes:
         policy: `Learned` of {"mean": network, "log_std": [A]}.
-        value: Of the state value.
-        discriminator: Of the logit of D, the probability that (s, a) is the expert's.
+        value: `Learned` of the state value.
+        discriminator: `Learned` of the logit of D, the probability that (s, a) is the expert's.
     """
 
     policy: Learned
@@ -214,7 +214,7 @@ class PPOBatch(NamedTuple):
 
     Attributes:
         observation, action: [B, O], [B, A].
-        log_prob: Of the actions when they were made.
+        log_prob: Log-density of the actions when they were made.
         advantage: Normalised.
         returns: Targets of the value.
     """
@@ -271,7 +271,7 @@ def improve(
     networks: Networks,
     batch_size: int,
 ) -> tuple[GAILLearned, jax.Array]:
-    """PPO's epochs over one rollout: what was learned, and the mean loss of the value."""
+    """PPO's epochs over one rollout: all that was learned, and the mean loss of the value."""
     count = rollout.action.shape[0]
     batches = max(count // batch_size, 1)
 

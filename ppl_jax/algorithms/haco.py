@@ -57,9 +57,9 @@ class HACOLearned:
 
     Attributes:
         actor: `Learned` of a squashed Gaussian: its network gives mean and log standard deviation.
-        value: Of twin proxy values Q, with target networks.
-        cost: Of twin values Q_int of the intervention cost, with target networks.
-        log_alpha: Of the entropy's temperature.
+        value: `Learned` of twin proxy values Q, with target networks.
+        cost: `Learned` of twin values Q_int of the intervention cost, with target networks.
+        log_alpha: `Learned` of the logarithm of the entropy's temperature.
     """
 
     actor: Learned
