@@ -27,7 +27,7 @@ import numpy as np
 
 from experiments.engine.files import write_atomic
 from experiments.engine.run_folder import RunFolder
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from ppl_jax.types import Env, Interaction, Trajectory
 
 FOLDER = "recording"
@@ -238,14 +238,10 @@ def export_minari(run: Path, name: str) -> int:
     Raises:
         UserError: If Minari is not installed, has a data set of that name, or there is nothing.
     """
-    try:
-        import gymnasium
-        import minari
-        from minari.data_collector import EpisodeBuffer
-    except ImportError as error:
-        raise UserError(
-            f"a Minari data set needs the package {error.name}: pip install 'ppl-jax[minari]'"
-        ) from error
+    minari = need("minari", "minari", "a Minari data set")
+    import gymnasium
+    from minari.data_collector import EpisodeBuffer
+
     columns, config = load(run)
     size, actions = columns["observation"].shape[1], columns["executed_action"].shape[1]
     found = []

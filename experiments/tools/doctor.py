@@ -60,7 +60,7 @@ def _installed(module: str) -> bool:
 PIECES = (
     Piece("render", "pictures, GIFs and MP4 films", ("PIL", "av")),
     Piece("plot", "figures", ("matplotlib",)),
-    Piece("manipulation", "pictures of the UR5e worlds, their C MuJoCo twin", ("mujoco", "mujoco.mjx")),
+    Piece("manipulation", "pictures of the UR5e worlds, and C MuJoCo", ("mujoco", "mujoco.mjx")),
     Piece("brax", "the brax adapter", ("brax",)),
     Piece("ray", "sweeps on a Ray cluster", ("ray",)),
     Piece("ui", "a person in the browser", ("starlette", "uvicorn", "websockets", "PIL")),
@@ -69,12 +69,21 @@ PIECES = (
     Piece(
         "dev",
         "tests, static checks and notebooks",
-        ("pytest", "xdist", "pytest_timeout", "hypothesis", "importlinter", "pyright", "nbclient",
-         "ipykernel", "playwright"),
-        ("ruff",),
+        (
+            "pytest",
+            "xdist",
+            "pytest_timeout",
+            "hypothesis",
+            "importlinter",
+            "pyright",
+            "nbclient",
+            "ipykernel",
+            "playwright",
+            "ruff",
+        ),
     ),
     Piece("chromium", "tests in the browser", (), BROWSERS, "apt-get install -y chromium"),
-)  # fmt: skip
+)
 
 
 def doctor() -> None:
