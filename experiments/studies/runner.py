@@ -42,7 +42,7 @@ from ppl_jax.cards import card
 from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
-    from experiments.cli import Sweep
+    from experiments.options.commands import Sweep
 
 SETTINGS = "sweep.json"
 LOG = "workers.log"
