@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from experiments.cli import main
 from ppl_jax import buffers
 from ppl_jax.algorithms import Algorithm, register
-from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import bc_loss
 from ppl_jax.networks import layers, make_policy
 

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.fields import setting
 from ppl_jax.gates import never
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy, make_raw
 from ppl_jax.ppo.losses import advantages, clipped_loss

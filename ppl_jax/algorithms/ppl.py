@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax import buffers, horizon
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import (
     NEEDS_REFERENCE,
     Metrics,

@@ -38,9 +38,9 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.experts import SavedPolicy
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import layers
 from ppl_jax.ppo.cloning import clone
