@@ -219,7 +219,18 @@ def _sweep(command: Sweep) -> None:
     from experiments.studies.runner import sweep
 
     start_jax()
-    sweep(command)
+    with _continued_by("ppl", *sys.argv[1:]):
+        sweep(command)
+    if not command.dry_run:
+        _show_results(command.out)
+
+
+def _show_results(out: Path) -> None:
+    """The table of a finished folder of runs, and what to do next with it."""
+    from experiments.report.tables import table
+
+    table(out)
+    print(f"\nresults are in {out}; next: ppl figure {out}, or ppl table {out} --format latex")
 
 
 def _horizon(command: Horizon) -> None:

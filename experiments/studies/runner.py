@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs.registry import known, unknown
+from experiments.engine import compile_log
 from experiments.engine import schedulers as engines
 from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
@@ -218,8 +219,13 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
     failed = {}
     with Progress(len(runs), "runs", len(done)) as progress:
         progress.start()
+        if jobs:
+            first = compile_log.phrase(*_program(jobs[0][1][0]))
+            progress.say(f"{first}; the first run of each program compiles")
         for number, reply in _engine(execution, [job for job, _ in jobs], out / LOG):
             compiling = reply.get("compile_s", 0.0) / _workers(execution)
+            if compiling:
+                compile_log.remember(_program(jobs[number][1][0])[1], reply["compile_s"])
             progress.began += compiling  # says nothing of what is left
             for run, rows in _replies(reply, jobs[number], runs):
                 if isinstance(rows, str):
@@ -236,6 +242,13 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
             f"{len(failed)} of {len(runs)} runs failed (the same command tries them again); "
             f"{name}: {why}"
         )
+
+
+def _program(run: Run) -> tuple[str, str]:
+    """What the program of a run is called, for people and in the log of compile times."""
+    settings = run.settings
+    name = f"{settings.algorithm} in {settings.env}"
+    return name, f"sweep: {name}, {settings.config.total_steps} steps"
 
 
 def policy_name(run: str) -> str:
