@@ -116,7 +116,12 @@ def _seeds(parsed: Any) -> Any:
 
 def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     """A sweep's class with an axis for every setting, and what turns its record into a request."""
-    from experiments.options.settings import axis_fields, axis_values, settings_in
+    from experiments.options.settings import (
+        axis_fields,
+        axis_values,
+        settings_in,
+        shows_everything,
+    )
     from experiments.studies.grid import STUDIES
 
     study = next((word for word in argv if word in STUDIES), None)
@@ -124,7 +129,9 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     if "--algorithms" not in argv and study is not None:
         words += ["--algorithms", *STUDIES[study].algorithms]
     settings = settings_in(words, sweeping=True)
-    axes = dataclasses.make_dataclass("axes", axis_fields(settings, everything=HELP_ALL in argv))
+    axes = dataclasses.make_dataclass(
+        "axes", axis_fields(settings, everything=shows_everything(argv))
+    )
     member = ("axes", tyro.conf.OmitArgPrefixes[axes], dataclasses.field(default_factory=axes))
     made = dataclasses.make_dataclass(cls.__name__, [member], bases=(cls,))
     made.__doc__ = cls.__doc__

@@ -26,6 +26,7 @@ from experiments.engine.expert_settings import (
     FIRST_SCENARIO,
     ExpertSettings,
     check,
+    read_settings,
 )
 from experiments.engine.policy_file import save_policy
 from experiments.engine.progress import Progress
@@ -74,7 +75,7 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     except ValueError as error:
         raise UserError(str(error)) from error
     if resume:
-        before = ExpertSettings.from_json(read_config(folder))
+        before = read_settings(folder)
         refuse_contradictions(out, one_level(before.as_json()), one_level(settings.as_json()))
     else:
         open_folder(folder, settings.as_json(), resume=False)
@@ -96,18 +97,6 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
             if note is not None:
                 progress.update(batch * config.batch_steps, note)
     return run.finish(learner, time.perf_counter() - began)
-
-
-def read_config(folder: RunFolder) -> dict[str, Any]:
-    """The content of a run folder's config.json.
-
-    Raises:
-        UserError: If the folder is no run folder.
-    """
-    try:
-        return folder.config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
 
 
 def _restore(folder: RunFolder, learner: PPOLearner) -> tuple[int, PPOLearner]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from envs.registry import known, unknown
+from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import MAX_SEED, SCHEMA
 from ppl_jax.cards import card
@@ -27,7 +28,7 @@ class ExpertSettings:
         env, seed: What is trained.
         config, hparams: Static and traced settings.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
-        training_scenarios: Number of generated scenarios to train on; the environment's own where 0.
+        training_scenarios: Number of generated scenarios to train on; 0 for the environment's own.
         evaluate_every: Batches between evaluations and checkpoints.
     """
 
@@ -51,14 +52,9 @@ class ExpertSettings:
         """The inverse of `as_json`, of older versions too; ignores what else config.json holds.
 
         Raises:
-            UserError: If it is none of `ppl expert train`, or of a newer version, or holds what no
-                version has.
+            UserError: If it is of a newer version, or holds what no version has.
         """
         schema = content.get("schema", 1)
-        if content.get("algorithm") != ALGORITHM:
-            raise UserError(
-                f"config.json is of {content.get('algorithm')!r}, not of `ppl expert train`"
-            )
         if schema > SCHEMA:
             raise UserError(
                 f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
@@ -79,6 +75,24 @@ PLAIN = tuple(
     if field.name not in ("config", "hparams")
 )
 """The fields of `ExpertSettings` beside the settings of PPO-Lagrangian."""
+
+
+def read_settings(folder: RunFolder) -> ExpertSettings:
+    """The settings of the run in a folder.
+
+    Raises:
+        UserError: If it is no run folder of `ppl expert train`.
+    """
+    try:
+        content = folder.config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    if content.get("algorithm") != ALGORITHM:
+        raise UserError(
+            f"{str(folder.path)!r} is a run of {content.get('algorithm')}, not of "
+            "`ppl expert train`"
+        )
+    return ExpertSettings.from_json(content)
 
 
 def flat(config: PPOConfig, hparams: PPOHParams) -> dict[str, Any]:

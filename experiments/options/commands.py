@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, subcommand
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, arg, subcommand
 
 
 @dataclasses.dataclass
@@ -113,10 +113,9 @@ class Tune:
 
 @dataclasses.dataclass
 class ExpertTrain:
-    """Train a neural expert by PPO-Lagrangian: progress, then the evaluation table; a run folder.
+    """Train a neural expert by PPO-Lagrangian: progress, then its evaluation; a run folder."""
 
-    Its options are generated when it is asked for; see `experiments.options.expert`.
-    """
+    # its options are generated when it is asked for: see `experiments.options.expert`
 
 
 @dataclasses.dataclass
@@ -205,12 +204,15 @@ def expert_command(train: type) -> type:
     Args:
         train: Class of its `train`.
     """
-    command: Any = (
-        Annotated[train, subcommand("train")]
-        | Annotated[ExpertEvaluate, subcommand("evaluate")]
-        | Annotated[ExpertCard, subcommand("card")]
+    parts: tuple[Any, ...] = (
+        Annotated[train, subcommand("train")],
+        Annotated[ExpertEvaluate, subcommand("evaluate")],
+        Annotated[ExpertCard, subcommand("card")],
     )
-    made = dataclasses.make_dataclass("Expert", [("command", OmitSubcommandPrefixes[command])])
+    command = parts[0] | parts[1] | parts[2]
+    made = dataclasses.make_dataclass(
+        "Expert", [("command", Annotated[OmitSubcommandPrefixes[command], arg(name="")])]
+    )
     made.__doc__ = "Train, evaluate or describe an expert."
     return made
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,11 +17,13 @@ from experiments.engine.expert_settings import (
     ExpertSettings,
     check,
     default_interval,
+    read_settings,
     settings_for,
 )
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import refuse_contradictions
+from experiments.options.commands import ExpertTrain
 from experiments.options.settings import (
     HELP_ALL,
     environments,
@@ -28,6 +31,7 @@ from experiments.options.settings import (
     is_given,
     option_fields,
     refuse_old_names,
+    shows_everything,
     word_after,
 )
 from ppl_jax.ppo.config import OLD_NAMES, PPOConfig, PPOHParams, catalogue, replace
@@ -126,11 +130,17 @@ def expert_options(argv: Sequence[str]) -> ExpertOptions:
     shown = before or new_settings(env)
     defaults = {"out": None, "resume": False, **values_of(shown)}
     settings = catalogue(shown.config, shown.hparams)
-    groups = option_fields(settings, everything=HELP_ALL in argv, groups=GROUPS)
+    groups = option_fields(settings, everything=shows_everything(argv), groups=GROUPS)
+    hint = f"(default: {env})" if before is not None else "(required)"
+    told = tyro.conf.arg(
+        metavar="ENV",
+        help=f"One of {environments()}, brax:NAME.",
+        help_behavior_hint=hint,
+    )
     members: list[Any] = [
         (
             "env",
-            Annotated[str, Positional, tyro.conf.arg(help=f"One of {environments()}, brax:NAME.")],
+            Annotated[str, Positional, told],
             dataclasses.field(default=env if before is not None else ""),
         )
     ]
@@ -146,8 +156,29 @@ def expert_options(argv: Sequence[str]) -> ExpertOptions:
         part = dataclasses.make_dataclass(group, fields + groups[group])
         members.append((group, OmitArgPrefixes[part], dataclasses.field(default_factory=part)))
     cls = dataclasses.make_dataclass("ExpertTrain", members)
-    cls.__doc__ = "Train a neural expert by PPO-Lagrangian: progress, then the evaluation table; a run folder."
+    cls.__doc__ = f"{ExpertTrain.__doc__} {HELP_ALL} shows every option."
     return ExpertOptions(cls=cls, env=env, before=before)
+
+
+def command_of(settings: ExpertSettings) -> str:
+    """The command line that makes a run again, given the defaults of this version."""
+    usual = new_settings(settings.env)
+    usual = dataclasses.replace(
+        usual,
+        training_scenarios=0 if settings.scenarios is not None else usual.training_scenarios,
+        evaluate_every=default_interval(settings.config),
+    )
+    defaults, words = values_of(usual), ["ppl", "expert", "train", settings.env]
+    for name, value in values_of(settings).items():
+        if value == defaults[name]:
+            continue
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            listed = value if isinstance(value, tuple) else (value,)
+            words += [f"--{option}", *map(str, listed)]
+    return shlex.join(words)
 
 
 def _before(argv: Sequence[str]) -> ExpertSettings | None:
@@ -157,10 +188,7 @@ def _before(argv: Sequence[str]) -> ExpertSettings | None:
     out = word_after(argv, "--out")
     if out is None:
         raise UserError("--resume needs --out, the run folder to continue")
-    try:
-        return ExpertSettings.from_json(RunFolder(out).config())
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    return read_settings(RunFolder(out))
 
 
 def expert_request(parsed: Any, options: ExpertOptions, argv: Sequence[str]) -> ExpertTrainRequest:

@@ -118,6 +118,14 @@ def refuse_old_names(
                 raise UserError(f"{name} {value!r} is called {renamed[value]!r} now")
 
 
+def shows_everything(argv: Sequence[str]) -> bool:
+    """Whether options that are not common are there too.
+
+    Only `--help` leaves them out: what help hides could not be given either.
+    """
+    return HELP_ALL in argv or not {"-h", "--help"} & set(argv)
+
+
 def choices_of(setting: Setting) -> tuple[str, ...] | None:
     """The names that a setting allows; a user's gates and predictors among them."""
     if setting.name == "gate":
@@ -143,7 +151,7 @@ def option_fields(
 
     Args:
         settings: By name.
-        everything: Whether help shows all of them, or the common ones alone.
+        everything: Whether all of them are there, or the common ones alone.
         groups: Names of the groups.
     """
     fields: dict[str, list[Any]] = {group: [] for group in groups}

@@ -166,7 +166,7 @@ class PPOConfig:
     )
     demonstrations: int = setting(
         0,
-        "Steps that the scripted expert labels under noise and that the policy clones first.",
+        "Steps that a scripted expert labels under noise and that the policy clones first.",
         low=0,
         group="demonstrations",
         common=True,
