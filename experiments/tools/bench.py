@@ -262,7 +262,7 @@ def _expert(name: str, repeats: int) -> dict[str, float]:
     Of the trainer alone: no guidance by a teacher, no batch cut short. The share is what a batch
     with all its epochs takes longer than one with a single epoch, per epoch and times their number.
     """
-    from experiments.engine.expert import settings_for
+    from experiments.engine.expert_settings import settings_for
 
     env = make(name)
     settings, hparams, _ = settings_for(name)
