@@ -323,7 +323,7 @@ def _render(command: Render) -> None:
     from experiments.report.film import render
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps, command.env)
+    render(command.run, command.scenario, command.out, command.steps, world=command.env)
     print(f"wrote {command.out}")
 
 

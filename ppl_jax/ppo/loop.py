@@ -334,7 +334,7 @@ def iterate(problem: Problem, learner: PPOLearner, _: None) -> tuple[PPOLearner,
     learned = dataclasses.replace(
         before,
         multiplier=update_multiplier(
-            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known
+            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known=known
         ),
     )
     learned, batch, metrics = prepare(problem, learned, steps, hparams)

@@ -33,7 +33,7 @@ def nut_xml() -> str:
         grasp_contact.FEET,
         2 * len(gripper.PAD_ROWS),
         soft,
-        grasp_contact.FRICTION,
+        friction=grasp_contact.FRICTION,
     )
 
 

@@ -144,7 +144,7 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
     def step(s: NutState, _: None) -> tuple[NutState, None]:
         command = jnp.clip(s.command + grip, -1.0, 1.0)
         motion = operational_space.free_motion(
-            list(s.joints), list(s.speeds), goal, GRIPPER, weight
+            list(s.joints), list(s.speeds), goal, GRIPPER, weight=weight
         )
         ring = Ring(s.position - BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
         knuckles, inner = s.fingers[::3], s.fingers[1::3]
@@ -153,9 +153,9 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
             ring,
             knuckles,
             s.finger_speeds[::3],
-            inner,
-            gripper.command_to_control(command),
-            s.acceleration,
+            inner=inner,
+            control=gripper.command_to_control(command),
+            start=s.acceleration,
         )
         a = result.acceleration
         speeds = s.speeds + TIMESTEP * a[:6]
@@ -188,7 +188,7 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
 
 
 def stages(
-    eef: jax.Array, position: jax.Array, handle: jax.Array, touching: jax.Array, time: jax.Array
+    eef: jax.Array, position: jax.Array, handle: jax.Array, touching: jax.Array, *, time: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Robosuite's staged reward (reach, grasp, lift, hover), [4], and whether the ring is on.
 
@@ -277,7 +277,9 @@ class NutAssembly(ArmTask):
         at = lagged_frames(new, GRIPPER)
         eef = jnp.stack(at.position) + BASE
         position, quaternion = lagged_ring(new)
-        staged, on = stages(eef, position, handle_of(position, quaternion), new.touching, new.time)
+        staged, on = stages(
+            eef, position, handle_of(position, quaternion), new.touching, time=new.time
+        )
         near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
         success = on & (near < PRESENCE) & ~physics_diverged
         fallen = position[2] < FALLEN

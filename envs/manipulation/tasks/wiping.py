@@ -171,7 +171,9 @@ def advance(
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
         joints, speeds, acceleration, _ = carry
-        motion = operational_space.free_motion(list(joints), list(speeds), goal, WIPER, weight)
+        motion = operational_space.free_motion(
+            list(joints), list(speeds), goal, WIPER, weight=weight
+        )
         touch = press(motion, table, acceleration)
         speeds = speeds + TIMESTEP * touch.acceleration
         return (joints + TIMESTEP * speeds, speeds, touch.acceleration, touch.force), None
@@ -186,6 +188,7 @@ def reward_of(
     wiped: jax.Array,
     markers: jax.Array,
     eef: jax.Array,
+    *,
     force: jax.Array,
     contact: jax.Array,
     count: jax.Array,
@@ -308,9 +311,9 @@ class TableWiping(ArmTask):
             wiped,
             state.markers,
             jnp.stack(at.position) + BASE,
-            jnp.linalg.norm(state.force),
-            contact,
-            count,
+            force=jnp.linalg.norm(state.force),
+            contact=contact,
+            count=count,
         )
         success = jnp.all(wiped) & ~physics_diverged
         time = state.time + 1
