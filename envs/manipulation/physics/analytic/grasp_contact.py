@@ -161,6 +161,7 @@ def _around_peg(beads: jax.Array) -> _Points:
 def hold(
     motion: Motion,
     ring: Ring,
+    *,
     fingers: jax.Array,
     finger_speeds: jax.Array,
     *,
