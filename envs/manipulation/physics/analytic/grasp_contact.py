@@ -164,7 +164,6 @@ def hold(
     *,
     fingers: jax.Array,
     finger_speeds: jax.Array,
-    *,
     inner: jax.Array,
     control: jax.Array,
     start: jax.Array,
