@@ -123,12 +123,11 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
         "axes", axis_fields(settings, everything=shows_everything(argv))
     )
     member = ("axes", tyro.conf.OmitArgPrefixes[axes], dataclasses.field(default_factory=axes))
-    made = dataclasses.make_dataclass(cls.__name__, [member], bases=(cls,))
+    made = dataclasses.make_dataclass(cls.__name__, [member], bases=(cls,), frozen=True)
     made.__doc__ = cls.__doc__
 
     def finish(parsed: Any) -> Any:
-        parsed.axes = axis_values(settings, parsed.axes)
-        return parsed
+        return dataclasses.replace(parsed, axes=axis_values(settings, parsed.axes))
 
     return made, finish
 

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -76,8 +76,10 @@ def algorithm_factory(settings: RunSettings, env: Env) -> algorithms.MakeAlgorit
     make = algorithms.method(settings.algorithm).make
     if settings.reference_policy is None:
         return make
+    # a method whose objective has a reference takes it by keyword
+    takes_reference = cast(Callable[..., algorithms.Algorithm], make)
     policy = arrays_of(read_policy(settings.reference_policy, env.spec))
-    return functools.partial(make, reference=functools.partial(experts.act, policy))
+    return functools.partial(takes_reference, reference=functools.partial(experts.act, policy))
 
 
 def saved_policy(env: Env, layers: Layers) -> SavedPolicy:

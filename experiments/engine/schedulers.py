@@ -76,6 +76,7 @@ class _Process:
         self.process: subprocess.Popen[str] | None = None
 
     def run(self, job: Job) -> Reply:
+        code = None
         for _ in range(TRIES):
             process = self.process or self._start()
             try:

@@ -146,7 +146,7 @@ class ExpertCard:
     """Replace the files of an earlier card in --out."""
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Sweep:
     """Train every combination of settings with every seed; resumes.
 
@@ -190,7 +190,7 @@ class Sweep:
     """Folder of the result files; finished runs in it are kept."""
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Robustness(Sweep):
     """Train under noise on predicted states (or on the expert's actions); resumes."""
 

@@ -52,7 +52,7 @@ def ablation(command: Ablation) -> None:
     for seed in command.seeds:
         for label, given in rows.items():
             needs = given.get("objective") in NEEDS_REFERENCE
-            common = {"reference_policy": reference} if needs else {}
+            common: dict[str, Any] = {"reference_policy": reference} if needs else {}
             settings = settings_of(command, "ppl", seed, given, **common)
             name = f"{command.env}/{label}/seed={seed}"
             runs.append(Run(name, (), settings, label))

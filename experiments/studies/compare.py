@@ -76,6 +76,7 @@ def settings_of(
     if command.total_steps is not None and not own_length:
         asked["total_steps"] = command.total_steps
     every = None if own_length else command.evaluate_every
+    common.setdefault("evaluate_every", every)
     for name in COMMON:
         value = getattr(command, name, None)
         if value is not None:
@@ -85,7 +86,7 @@ def settings_of(
         algorithm,
         seed,
         given={**asked, **given},
-        **({"evaluate_every": every} | common),
+        **common,
     )
     check(settings)
     return settings

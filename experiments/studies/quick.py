@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,14 +64,13 @@ class Result:
         pyplot = need("matplotlib.pyplot", "plot", "plot()")
         _, axes = pyplot.subplots()
         names = [name for name in self.axes if name != "seed"]
-        groups = self.curve.groupby(names, sort=False) if names else [((), self.curve)]
         count = 0
-        for values, rows in groups:
-            by_step = rows.groupby("step")[column]
+        for values, rows in _groups(self.curve, names):
+            shown = rows.groupby("step")[column].agg(["mean", "min", "max"])
             label = ", ".join(f"{k} = {v:g}" for k, v in zip(names, values, strict=True))
-            (line,) = axes.plot(by_step.mean(), label=label or None)
+            (line,) = axes.plot(shown["mean"], label=label or None)
             axes.fill_between(
-                by_step.min().index, by_step.min(), by_step.max(), color=line.get_color(), alpha=0.2
+                shown.index, shown["min"], shown["max"], color=line.get_color(), alpha=0.2
             )
             count += 1
         axes.set(xlabel="environment steps", ylabel=column.replace("_", " "))
@@ -80,6 +79,17 @@ class Result:
         if count > 1:
             axes.legend()
         return axes
+
+
+def _groups(
+    curve: pd.DataFrame, names: list[str]
+) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+    """Rows of `curve` for each combination of values of `names`, in order."""
+    if not names:
+        yield (), curve
+        return
+    for values, rows in curve.groupby(names, sort=False):
+        yield values if isinstance(values, tuple) else (values,), rows
 
 
 def train(

@@ -87,7 +87,7 @@ def plan(command: Sweep) -> list[Run]:
     return widen(runs)
 
 
-def _axes(command: Sweep, env: str) -> dict[str, tuple[Any, ...]]:
+def _axes(command: Sweep, env: str) -> dict[str, Sequence[Any]]:
     given = dict(command.axes)
     study = dict(found.axes) if (found := _study(command)) else {}
     if env != "driving" and command.study == "predictor" and "predictor" not in given:

@@ -248,7 +248,7 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
             times.append((time.perf_counter() - began) / steps * 1e3)
         return float(np.median(times[1:])), compile_s
 
-    cached = jax.config.jax_enable_compilation_cache
+    cached = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
     try:
         alone, compile_s = program(make, 1)
@@ -279,7 +279,7 @@ def _expert(name: str, repeats: int) -> dict[str, float]:
     env = make(name)
     settings, hparams, _ = settings_for(name)
     config = PPOConfig(scaling=settings.scaling)
-    hparams = hparams.replace(target_kl=1e9)
+    hparams = dataclasses.replace(hparams, target_kl=1e9)
     seconds, compile_s = {}, 0.0
     for epochs in (1, config.epochs):
         functions = make_ppo_lagrangian(env, dataclasses.replace(config, epochs=epochs))
