@@ -26,13 +26,14 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.checks import check_name
+from ppl_jax.types import Array
 
 LIKELIHOODS = ("gaussian", "laplace")
 LAPLACE_SCALE = 0.1  # b
 LAPLACE_CORE = 0.1  # w
 
 
-def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -> jax.Array:
+def log_likelihood(mean: Array, action: Array, kind: str = "gaussian") -> jax.Array:
     """Log pi(action | mean) up to a constant, [..., A], [..., A] -> [...].
 
         gaussian    -|a - mu|^2
@@ -54,7 +55,7 @@ def log_likelihood(mean: jax.Array, action: jax.Array, kind: str = "gaussian") -
     return -(jnp.sqrt(square + LAPLACE_CORE**2) - LAPLACE_CORE) / LAPLACE_SCALE
 
 
-def gaussian_log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
+def gaussian_log_prob(mean: Array, log_std: Array, action: Array) -> jax.Array:
     """Log-density of a diagonal Gaussian without squashing (PPO's), [..., A] -> [...].
 
         log N(a) = sum -((a - mu) / s)^2 / 2 - log s - log(2 pi) / 2
@@ -69,9 +70,7 @@ def gaussian_log_prob(mean: jax.Array, log_std: jax.Array, action: jax.Array) ->
     return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), -1)
 
 
-def squashed_gaussian(
-    key: jax.Array, mean: jax.Array, log_std: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def squashed_gaussian(key: jax.Array, mean: Array, log_std: Array) -> tuple[jax.Array, jax.Array]:
     """A reparameterised sample a = tanh(u), u ~ N(mean, std), and its log-density.
 
         log pi(a) = log N(u) - sum 2 (log 2 - u - softplus(-2 u))

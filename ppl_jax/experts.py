@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from ppl_jax.checks import check_name
 from ppl_jax.distributions import gaussian_log_prob
-from ppl_jax.types import Expert
+from ppl_jax.types import Array, Expert
 
 ACTIVATIONS, OUTPUTS = ("relu", "tanh"), ("tanh", "clip")
 
@@ -40,7 +40,7 @@ class SavedPolicy(NamedTuple):
         return act(self, jnp.asarray(observation))
 
 
-def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
+def act(policy: SavedPolicy, observation: Array) -> jax.Array:
     """The deterministic action, [..., O] -> [..., A].
 
     Raises:
@@ -59,7 +59,7 @@ def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:
     return jnp.tanh(x) if policy.output == "tanh" else jnp.clip(x, -1.0, 1.0)
 
 
-def log_density(policy: SavedPolicy, observation: jax.Array, action: jax.Array) -> jax.Array:
+def log_density(policy: SavedPolicy, observation: Array, action: Array) -> jax.Array:
     """Log of the density that a policy's Gaussian gives to an action, [..., O], [..., A] -> [...].
 
     Its mean is the deterministic action. It is the density before clipping to the action box, and

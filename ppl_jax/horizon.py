@@ -33,7 +33,7 @@ import jax.numpy as jnp
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.gates import gate
 from ppl_jax.predictors import Act, predict, predictor
-from ppl_jax.types import DecisionPoint, Env, Expert
+from ppl_jax.types import Array, DecisionPoint, Env, Expert
 
 MEMORY = 500  # predicted trajectories that the moving means look back
 
@@ -55,13 +55,13 @@ class Measured(NamedTuple):
 
 
 def measure(
-    observation: jax.Array,
-    predicted: jax.Array,
-    expert_actions: jax.Array,
+    observation: Array,
+    predicted: Array,
+    expert_actions: Array,
     *,
-    expert_action: jax.Array,
-    novice_action: jax.Array,
-    scale: jax.Array,
+    expert_action: Array,
+    novice_action: Array,
+    scale: Array,
 ) -> Measured:
     """Measure one intervention's predicted states.
 
@@ -89,9 +89,7 @@ def measure(
     )
 
 
-def coverage(
-    visited: jax.Array, predicted: jax.Array, valid: jax.Array, scale: jax.Array
-) -> jax.Array:
+def coverage(visited: Array, predicted: Array, valid: Array, scale: Array) -> jax.Array:
     """Mean distance from visited states to the nearest state with a preference, for L = 1..M, [M].
 
     Args:

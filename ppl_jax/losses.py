@@ -29,6 +29,7 @@ import jax.numpy as jnp
 
 from ppl_jax.checks import check_name
 from ppl_jax.distributions import log_likelihood
+from ppl_jax.types import Array
 
 Metrics = dict[str, jax.Array]
 
@@ -39,8 +40,8 @@ NEEDS_REFERENCE = ("dpo", "ipo")
 
 
 def bc_loss(
-    mean: jax.Array,
-    expert_action: jax.Array,
+    mean: Array,
+    expert_action: Array,
     likelihood: str = "gaussian",
     reduction: str = "sum",
     *,
@@ -85,10 +86,10 @@ class PairLikelihoods(NamedTuple):
 
 
 def pair_likelihoods(
-    preferred_mean: jax.Array,
-    preferred_action: jax.Array,
-    rejected_mean: jax.Array,
-    rejected_action: jax.Array,
+    preferred_mean: Array,
+    preferred_action: Array,
+    rejected_mean: Array,
+    rejected_action: Array,
     *,
     bias: jax.Array | float = 1.0,
     likelihood: str = "gaussian",
@@ -114,7 +115,7 @@ def pair_likelihoods(
     )
     chex.assert_rank(preferred_mean, 2)
 
-    def log_pi(mean: jax.Array, action: jax.Array) -> jax.Array:
+    def log_pi(mean: Array, action: Array) -> jax.Array:
         return log_likelihood(mean, action, likelihood)
 
     frozen: jax.Array | float = 0.0
