@@ -24,8 +24,8 @@ from experiments.options.commands import (
     Doctor,
     Evaluate,
     Expert,
+    ExpertCard,
     ExpertEvaluate,
-    ExpertTrain,
     Export,
     Figure,
     Horizon,
@@ -38,6 +38,7 @@ from experiments.options.commands import (
     Sweep,
     Table,
     Tune,
+    expert_command,
 )
 from ppl_jax import __version__
 
@@ -83,6 +84,13 @@ def parse(argv: Sequence[str]) -> Any:
 
         classes["train"], defaults = train_options(argv[argv.index(named) + 1 :])
         finish = lambda parsed: train_request(parsed, defaults, argv)  # noqa: E731
+    elif named == "expert" and "train" in argv:
+        from experiments.options.expert import expert_options, expert_request
+
+        words = argv[argv.index("train") + 1 :]
+        options = expert_options(words)
+        classes["expert"] = expert_command(options.cls)
+        finish = lambda parsed: expert_request(parsed.command, options, words)  # noqa: E731
     elif named in ("sweep", "robustness"):
         classes[named], finish = _with_axes(classes[named], argv)
     words = ["--help" if word == HELP_ALL else word for word in argv]
@@ -98,7 +106,12 @@ def parse(argv: Sequence[str]) -> Any:
 
 def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     """A sweep's class with an axis for every setting, and what turns its record into a request."""
-    from experiments.options.settings import axis_fields, axis_values, settings_in
+    from experiments.options.settings import (
+        axis_fields,
+        axis_values,
+        settings_in,
+        shows_everything,
+    )
     from experiments.studies.grid import STUDIES
 
     study = next((word for word in argv if word in STUDIES), None)
@@ -106,7 +119,9 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     if "--algorithms" not in argv and study is not None:
         words += ["--algorithms", *STUDIES[study].algorithms]
     settings = settings_in(words, sweeping=True)
-    axes = dataclasses.make_dataclass("axes", axis_fields(settings, everything=HELP_ALL in argv))
+    axes = dataclasses.make_dataclass(
+        "axes", axis_fields(settings, everything=shows_everything(argv))
+    )
     member = ("axes", tyro.conf.OmitArgPrefixes[axes], dataclasses.field(default_factory=axes))
     made = dataclasses.make_dataclass(cls.__name__, [member], bases=(cls,))
     made.__doc__ = cls.__doc__
@@ -209,7 +224,18 @@ def _sweep(command: Sweep) -> None:
     from experiments.studies.runner import sweep
 
     start_jax()
-    sweep(command)
+    with _continued_by("ppl", *sys.argv[1:]):
+        sweep(command)
+    if not command.dry_run:
+        _show_results(command.out)
+
+
+def _show_results(out: Path) -> None:
+    """The table of a finished folder of runs, and what to do next with it."""
+    from experiments.report.tables import table
+
+    table(out)
+    print(f"\nresults are in {out}; next: ppl figure {out}, or ppl table {out} --format latex")
 
 
 def _horizon(command: Horizon) -> None:
@@ -234,55 +260,26 @@ def _figure(command: Figure) -> None:
     print(f"wrote {command.out}")
 
 
-def _expert(command: Expert) -> None:
-    if isinstance(command.command, ExpertTrain):
-        _expert_train(command.command)
-    elif isinstance(command.command, ExpertEvaluate):
-        _expert_evaluate(command.command)
-    else:
-        from experiments.report.card import write_card
+def _expert(command: Any) -> None:
+    part: ExpertEvaluate | ExpertCard = command.command
+    if isinstance(part, ExpertEvaluate):
+        _expert_evaluate(part)
+        return
+    from experiments.report.card import write_card
 
-        write_card(command.command.run, command.command.out, force=command.command.force)
+    write_card(part.run, part.out, force=part.force)
 
 
-def _expert_train(command: ExpertTrain) -> None:
-    from experiments.engine.expert import (
-        EVALUATIONS,
-        ExpertSettings,
-        check,
-        settings_for,
-        train_expert,
-    )
+def _expert_train(request: Any) -> None:
+    from experiments.engine.expert import train_expert
     from experiments.engine.runtime import start_jax
     from experiments.report.tables import print_run
 
-    config, hparams, training = settings_for(command.env)
-    given = {name: value for name, value in vars(command).items() if value is not None}
-    static = {f.name: given[f.name] for f in dataclasses.fields(config) if f.name in given}
-    traced = {f.name: given[f.name] for f in dataclasses.fields(hparams) if f.name in given}
-    config = dataclasses.replace(config, **static)
-    settings = ExpertSettings(
-        env=command.env,
-        seed=command.seed,
-        config=config,
-        hparams=dataclasses.replace(hparams, **traced),
-        scenarios=command.scenarios,
-        held_out_scenarios=command.held_out_scenarios,
-        training_scenarios=given.get(
-            "training_scenarios", training if command.scenarios is None else 0
-        ),
-        evaluate_every=given.get("evaluate_every", 1),
-    )
-    check(settings)
-    if command.evaluate_every is None:
-        every = max(config.batches // EVALUATIONS, 1)
-        settings = dataclasses.replace(settings, evaluate_every=every)
-    if command.resume and command.out is None:
-        raise UserError("--resume needs --out, the run folder to go on with")
-    name = f"{command.env.replace(':', '-')}-expert-{command.seed}"
-    out = command.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    settings = request.settings
+    out = request.out or new_folder(settings.env, "expert", settings.seed)
     start_jax()
-    train_expert(settings, out, command.resume)
+    with _continued_by("ppl", "expert", "train", "--resume", "--out", str(out)):
+        train_expert(settings, out, request.resume)
     print_run(out)
 
 
@@ -316,7 +313,7 @@ def _render(command: Render) -> None:
     from experiments.report.film import render
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps, command.env)
+    render(command.run, command.scenario, command.out, command.steps, world=command.env)
     print(f"wrote {command.out}")
 
 
@@ -418,6 +415,7 @@ _ACTIONS = {
     "Table": _table,
     "Figure": _figure,
     "Expert": _expert,
+    "ExpertTrainRequest": _expert_train,
     "Export": _export,
     "Render": _render,
     "Play": _play,

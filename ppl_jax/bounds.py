@@ -5,7 +5,7 @@ expert's h by three errors. With D_TV(P, Q) = |P - Q|_1 / 2,
 
     delta_dist = D_TV(d_n, d_pref)                        states visited, states with preferences
     delta_pref = E_{s ~ d_pref} D_TV(rho_ideal^s, rho_pref^s)   pairs as they are, as they should be
-    epsilon    = L_pref(n) - L_pref(h)                    what is left of the preference loss
+    epsilon    = L_pref(n) - L_pref(h)                    preference loss not yet minimised
 
     rho_ideal^s(a+, a-) = h(a+ | s) n(a- | s)
     L_pref(pi) = -E_{D_pref} log sigmoid(beta log pi(a+ | s) - beta log pi(a- | s))
@@ -53,7 +53,7 @@ class TabularMDP:
 
 
 class Bound(NamedTuple):
-    """Both sides of the theorem and what is in them, scalars.
+    """Both sides of the theorem and their terms, scalars.
 
     Attributes:
         gap: J(h) - J(n), discounted returns.
@@ -79,7 +79,7 @@ def total_variation(p: jax.Array, q: jax.Array, axis: int | tuple[int, ...] = -1
 
 
 def _check(mdp: TabularMDP, *policies: jax.Array) -> None:
-    """Check that a world's arrays and policies [S, A] fit each other."""
+    """Check that an MDP's arrays and policies [S, A] fit each other."""
     states, actions = mdp.reward.shape
     chex.assert_shape(mdp.transition, (states, actions, states))
     chex.assert_shape(mdp.start, (states,))
@@ -120,7 +120,7 @@ def preference_pairs(
     with the novice's action held (section 4.1).
 
     Args:
-        mdp: The world; it is its own predictor.
+        mdp: The environment; it is its own predictor.
         expert, novice: h and n, [S, A].
         taken_over: [S] distribution of states where the expert takes over.
         preference_horizon: L, 1 to `max_horizon`.
@@ -159,7 +159,7 @@ def bound(
     """Both sides of the theorem for policies h and n, [S, A] (all positive), and D_pref's pairs.
 
     Args:
-        mdp: The world.
+        mdp: The environment.
         expert, novice: h and n.
         pairs: [S, A, A] distribution of (state, a+, a-), such as `preference_pairs` gives.
         beta: Temperature of the preference loss.

@@ -76,7 +76,7 @@ def sample(buffer: RingBuffer, key: jax.Array, count: int) -> PyTree:
 
 @flax.struct.dataclass
 class SplitBuffer:
-    """Steps by who was in control, for methods that learn from both.
+    """Steps of either party in control, for methods that learn from both.
 
     Attributes:
         human: Steps under the expert's control.

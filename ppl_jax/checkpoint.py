@@ -87,7 +87,7 @@ def restore(folder: Path, like: PyTree, warn: Callable[[str], None]) -> tuple[in
     """The newest whole checkpoint as (step, tree), or None if there is none.
 
     Args:
-        folder: Of the checkpoints.
+        folder: Holds the checkpoints.
         like: A tree of the same structure, shapes and types.
         warn: Called with one line for each damaged checkpoint that is passed over.
     """
@@ -98,7 +98,7 @@ def restore(folder: Path, like: PyTree, warn: Callable[[str], None]) -> tuple[in
             tree = _orbax().load((path / "learner").absolute(), _abstract(like))
             if record["crc32"] != _checksum(tree):
                 raise ValueError("its contents do not match its checksum")
-        except Exception as error:  # whatever a damaged file makes Orbax raise
+        except Exception as error:  # a damaged file makes Orbax raise anything
             reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
             warn(f"checkpoint {path} is damaged ({reason[:120]}); trying the one before it")
             continue

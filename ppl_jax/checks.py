@@ -16,7 +16,7 @@ def check_name(argument: str, name: str, allowed: Iterable[str]) -> None:
     """Check that a name is one of those allowed.
 
     Args:
-        argument: Of the caller, as the message calls it.
+        argument: Its name in the message.
         name: Its value.
         allowed: The names that it may be.
 

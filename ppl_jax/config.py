@@ -198,19 +198,26 @@ def _kinds(cls: type) -> dict[str, Any]:
     return kinds
 
 
+def settings_of(part: Any, *, traced: bool) -> dict[str, Setting]:
+    """The settings in one record of a settings class, by name and in its order."""
+    kinds = _kinds(type(part))
+    return {
+        name: Setting(
+            name=name,
+            kind=kinds[name],
+            value=getattr(part, name),
+            about=about(field),
+            traced=traced,
+        )
+        for name, field in settings_fields(type(part)).items()
+    }
+
+
 def catalogue(config: TrainConfig, hparams: HParams) -> dict[str, Setting]:
     """Every setting of a run by its flat name, in the order of the classes."""
     found: dict[str, Setting] = {}
     for part, _, traced in _parts(config, hparams):
-        kinds = _kinds(type(part))
-        for name, field in settings_fields(type(part)).items():
-            found[name] = Setting(
-                name=name,
-                kind=kinds[name],
-                value=getattr(part, name),
-                about=about(field),
-                traced=traced,
-            )
+        found |= settings_of(part, traced=traced)
     return found
 
 

@@ -1,11 +1,11 @@
-"""The likelihood that the losses and `beta` refer to.
+"""The likelihood that the losses and `beta` mean.
 
 A policy outputs mu(s) in [-1, 1]^A; the paper does not say which density around it its log pi
 means, and `beta` means nothing without one. Two are offered; constants that cancel are left out.
 
 `laplace`: log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.1. A smoothed
 multivariate Laplace density: quadratic within w of mu (there it is a Gaussian of standard deviation
-0.1), linear beyond. What matters is the linear tail. Along the line from a- through a+ it makes
+0.1), linear beyond. The linear tail matters: along the line from a- through a+ it makes
 
     log pi(a+|s) - log pi(a-|s)
 

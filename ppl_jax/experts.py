@@ -1,4 +1,4 @@
-"""Experts as pure functions: a saved policy as an expert. Scripted ones live with their worlds."""
+"""Experts as pure functions: a saved policy as an expert. Scripted ones live with their envs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ ACTIVATIONS, OUTPUTS = ("relu", "tanh"), ("tanh", "clip")
 
 
 class SavedPolicy(NamedTuple):
-    """A policy as plain arrays: what an exported file holds.
+    """A policy as plain arrays, as in an exported file.
 
     Attributes:
         weights: (w [I, O], b [O]) per layer: `x @ w + b`.
         activation: Between layers: "relu" or "tanh".
-        output: Of the last layer: "tanh" squashes it, "clip" clips it to [-1, 1].
+        output: "tanh" squashes the last layer, "clip" clips it to [-1, 1].
         obs_mean, obs_scale: `(obs - mean) / scale` comes first.
         log_std: [A] of the Gaussian around the action, where the policy has one, else None.
     """
@@ -34,6 +34,10 @@ class SavedPolicy(NamedTuple):
     obs_mean: Any
     obs_scale: Any
     log_std: Any = None
+
+    def __call__(self, observation: Any) -> jax.Array:
+        """The deterministic action, [..., O] -> [..., A]; see `act`."""
+        return act(self, jnp.asarray(observation))
 
 
 def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:

@@ -1,13 +1,13 @@
-"""The gain and the cost of a preference horizon L: the theorem's two errors on real worlds.
+"""The gain and the cost of a preference horizon L: the theorem's two errors, measured.
 
 The theorem (`ppl_jax.bounds`) balances delta_dist, how far the states with preferences are from
 those that the novice visits, against delta_pref, how far the stored pairs are from the ones the
-expert would give there. On continuous worlds both distances are 1 almost surely. These can be
+expert would give there. In continuous environments both distances are 1 almost surely. These can be
 measured, at the i-th predicted state s~_i of an intervention at s:
 
     wrong_i = [ |h(s~_i) - a_h| >= |h(s~_i) - a_n| ]   asked there, it sides with the novice
     drift_i = |h(s~_i) - a_h|                          how far its answer has moved
-    reach_i = |s~_i - s|, in the world's units         how far the prediction has come from s
+    reach_i = |s~_i - s|, in the env's units           how far the prediction has come from s
 
 `preference_horizon="auto"` keeps moving means of drift, reach and |a_h - a_n| while it trains and
 takes the L that balances both errors, each as a share of its worst:
@@ -39,12 +39,12 @@ MEMORY = 500  # predicted trajectories that the moving means look back
 
 
 class Measured(NamedTuple):
-    """Of the predicted steps of one intervention, [..., M]; see the module's text.
+    """Measurements at the predicted steps of one intervention, [..., M]; see the top of this file.
 
     Attributes:
         wrong: 0 or 1.
         drift: In units of the action.
-        reach: In units of the world's observation scale.
+        reach: In units of the environment's observation scale.
         apart: |a_h - a_n|, [...].
     """
 
@@ -198,7 +198,7 @@ class Watched(NamedTuple):
     Attributes:
         observation: [O].
         predicted: [M, O] observations predicted for its action held.
-        measured: Of these predicted states.
+        measured: At these predicted states.
         valid: [M] the gate would have handed over here, and the prediction had not ended.
     """
 
@@ -218,13 +218,13 @@ def watch(
     hparams: HParams,
     steps: int,
 ) -> Watched:
-    """Let the novice alone play one world for `steps` steps, [steps, ...].
+    """Let the novice alone play one environment for `steps` steps, [steps, ...].
 
     At every step its action is predicted `config.method.max_preference_horizon` steps ahead and the
     expert asked at every predicted state.
 
     Args:
-        env: The world; its training scenarios are played.
+        env: The environment; its training scenarios are played.
         expert: Asked; it never acts.
         config: Gate, predictor and horizons.
         key: Random key.
@@ -250,9 +250,9 @@ def watch(
             transition,
             key_ahead,
             state,
-            held,
-            params,
-            max(config.prediction_horizon, most),
+            action=held,
+            params=params,
+            horizon=max(config.prediction_horizon, most),
             observe=True,
             labelling_expert=expert,
         )
@@ -332,7 +332,7 @@ def make_profile(
     expert: Expert,
     config: TrainConfig,
     *,
-    worlds: int = 8,
+    num_envs: int = 8,
     steps: int = 500,
     visited: int = 500,
     kept: int = 500,
@@ -343,10 +343,10 @@ def make_profile(
     predicted `config.method.max_preference_horizon` steps ahead and the expert asked at every one.
 
     Args:
-        env: The world.
+        env: The environment.
         expert: Asked; it never acts.
         config: Gate, predictor and horizons.
-        worlds, steps: Played side by side, and for how long.
+        num_envs, steps: Played side by side, and for how long.
         visited, kept: States and interventions that `coverage` is computed from.
 
     Raises:
@@ -361,8 +361,8 @@ def make_profile(
     def profile(key: jax.Array, act: Act, hparams: HParams) -> Profile:
         key, key_visited, key_kept = jax.random.split(key, 3)
         lane = functools.partial(watch, env, expert, config, act=act, hparams=hparams, steps=steps)
-        rows = jax.vmap(lambda key: lane(key=key))(jax.random.split(key, worlds))
-        seen = jax.tree.map(lambda leaf: leaf.reshape(worlds * steps, *leaf.shape[2:]), rows)
+        rows = jax.vmap(lambda key: lane(key=key))(jax.random.split(key, num_envs))
+        seen = jax.tree.map(lambda leaf: leaf.reshape(num_envs * steps, *leaf.shape[2:]), rows)
         return summarise(seen, (key_visited, key_kept), scale, visited=visited, kept=kept)
 
     return profile

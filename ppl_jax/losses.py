@@ -141,7 +141,7 @@ def preference_loss(
     """A preference objective; see the top of this file.
 
     Args:
-        pairs: Of a batch.
+        pairs: Log-likelihoods of a batch.
         beta: Temperature (of cpo and dpo; of ipo's library target).
         bias: 1 in the paper; 0.5 in the released code, where -bias is the "contrastive bias" of
             contrastive preference learning. The same as given to `pair_likelihoods`.

@@ -1,7 +1,7 @@
 """The networks. Flax Linen stays inside this file.
 
 All are MLPs with ReLU between layers whose input is the observation, centred and scaled by
-constants of the world (and, for a critic, the action).
+constants of the environment (and, for a critic, the action).
 """
 
 from __future__ import annotations

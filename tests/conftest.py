@@ -9,16 +9,35 @@ set_xla_flags()  # before JAX starts: tests run the programs that users run
 
 import jax  # noqa: E402
 
-CACHE = Path(__file__).parent.parent / ".pytest_cache" / "xla"
-DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+TESTS = Path(__file__).parent
+TIERS = ("unit", "worlds", "system", "browser")
+CACHE = TESTS.parent / ".pytest_cache" / "xla"
+DATA = TESTS.parent.parent / "shared" / "data"
 RECORDINGS = DATA / "metadrive"
 
 
 def pytest_configure(config):
+    for tier in TIERS:
+        config.addinivalue_line("markers", f"{tier}: every test in tests/{tier}")
     CACHE.mkdir(parents=True, exist_ok=True)
     os.environ["PPL_JAX_CACHE"] = str(CACHE)
     jax.config.update("jax_compilation_cache_dir", str(CACHE))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Mark each test with its tier; leave slow ones out unless they are asked for."""
+    for item in items:
+        tier = item.path.relative_to(TESTS).parts[0]
+        if tier in TIERS:
+            item.add_marker(tier)
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(3600))
+    if "slow" not in config.option.markexpr:
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        if slow:
+            config.hook.pytest_deselected(items=slow)
+            items[:] = [item for item in items if item not in slow]
 
 
 @pytest.fixture(scope="session")

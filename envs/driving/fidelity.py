@@ -115,7 +115,7 @@ def _edges(scenario: Scenario, lane: jax.Array, road: jax.Array, pose: jax.Array
 
 @jax.jit
 @jax.vmap
-def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
+def _observe(scenario, ego, before, action, *, lane, road, traffic, boxes):
     def one(ego, before, action, lane, road, traffic, boxes):
         _, lateral, left, right = _edges(scenario, lane, road, ego[:3])
         features = obs.ego_features(
@@ -141,7 +141,7 @@ def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
 
 @jax.jit
 @jax.vmap
-def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
+def _reward(scenario, ego, before, action, *, lane, road, traffic, boxes):
     params = driving.DrivingParams(scenarios=scenario)
 
     def one(ego, before, action, lane, road, traffic, boxes):
@@ -173,7 +173,7 @@ def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
 
 @jax.jit
 @jax.vmap
-def _replay(scenario, ego, before, last_action, actions):
+def _replay(scenario, ego, before, last_action, *, actions):
     """Positions after each of `WINDOW` recorded actions from every recorded state."""
 
     def one(ego, before, last_action, actions):
@@ -215,16 +215,20 @@ def compare(recordings: list[Recording]) -> dict[str, float]:
     )
     before = np.concatenate([ego[:, :1], ego[:, :-1]], 1)
     executed = np.concatenate([np.zeros_like(action[:, :1]), action], 1)
-    ours = np.asarray(_observe(scenario, ego, before, executed, lane, road, traffic, boxes))
+    ours = np.asarray(
+        _observe(
+            scenario, ego, before, executed, lane=lane, road=road, traffic=traffic, boxes=boxes
+        )
+    )
     rewards = _reward(
         scenario,
         ego[:, 1:],
         ego[:, :-1],
         action,
-        lane[:, 1:],
-        road[:, 1:],
-        traffic[:, 1:],
-        boxes[:, 1:],
+        lane=lane[:, 1:],
+        road=road[:, 1:],
+        traffic=traffic[:, 1:],
+        boxes=boxes[:, 1:],
     )
     windows = action.shape[1] - WINDOW + 1
     index = np.arange(windows)[:, None] + np.arange(WINDOW)
@@ -234,7 +238,7 @@ def compare(recordings: list[Recording]) -> dict[str, float]:
             ego[:, :windows],
             before[:, :windows],
             executed[:, :windows],
-            action[:, index],
+            actions=action[:, index],
         )
     )
     features, rays, reward_errors, position = [], [], [], []

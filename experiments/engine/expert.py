@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import flax.struct
 import jax
 import numpy as np
 
-from envs.registry import known, unknown
 from experiments.engine.evaluate import (
     EvaluationRow,
     evaluate_policy,
@@ -21,122 +21,27 @@ from experiments.engine.evaluate import (
     rows_of,
     summarise_episodes,
 )
+from experiments.engine.expert_settings import (
+    ALGORITHM,
+    FIRST_SCENARIO,
+    ExpertSettings,
+    check,
+    read_settings,
+)
 from experiments.engine.policy_file import save_policy
 from experiments.engine.progress import Progress
 from experiments.engine.run import open_folder, restore_learner
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import one_level, refuse_contradictions
 from ppl_jax import checkpoint
 from ppl_jax.evaluation import evaluate
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.ppo.config import PPOConfig, PPOHParams, validate
 from ppl_jax.ppo.loop import PPOFunctions, PPOLearner, make_ppo_lagrangian
 from ppl_jax.types import Env
 
-FIRST_SCENARIO = 10_000  # of those an expert trains on: neither the novice's nor held out
-EVALUATIONS = 40  # over a run, unless asked for otherwise
 
-
-@dataclasses.dataclass(frozen=True)
-class ExpertSettings:
-    """Everything that defines a run; config.json holds it.
-
-    Attributes:
-        env, seed: What is trained.
-        config, hparams: Static and traced settings.
-        scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
-        training_scenarios: Number of generated scenarios to train on; the world's own where 0.
-        evaluate_every: Batches between evaluations and checkpoints.
-    """
-
-    env: str
-    seed: int
-    config: PPOConfig
-    hparams: PPOHParams
-    scenarios: str | None = None
-    held_out_scenarios: str | None = None
-    training_scenarios: int = 0
-    evaluate_every: int = 1
-
-    def as_json(self) -> dict[str, Any]:
-        """For config.json."""
-        content = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        config = dataclasses.asdict(self.config)
-        hparams = {k: float(v) for k, v in dataclasses.asdict(self.hparams).items()}
-        return content | {"algorithm": "ppo_lagrangian", "config": config, "hparams": hparams}
-
-
-def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
-    """What trained the shipped expert of a world, and on how many scenarios; or the defaults."""
-    # each starts as a clone of the scripted expert, with little noise, and is improved gently
-    config = PPOConfig(demonstrations=100_000, critic_batches=10)
-    hparams = PPOHParams(
-        learning_rate=1e-4,
-        target_kl=0.01,
-        cost_limit=0.1,
-        initial_std=0.2,
-        demonstration_noise=0.2,
-    )
-    if env == "driving":
-        # What a clone lacks is situations, not steps: many maps, and of its demonstrations the one
-        # of twelve that it was worst at. Slow and safe, it has hardly anything left to earn, so the
-        # cost weighs five times the reward; left to itself it unlearns what it was shown, so it
-        # stays guided.
-        config = dataclasses.replace(
-            config,
-            total_steps=500_000,
-            hidden=(288, 288, 288),
-            demonstrations=14_400_000,
-            demonstration_stride=12,
-            demonstration_rounds=24,
-            cloning_updates=72_000,
-            guided=True,
-        )
-        hparams = hparams.replace(
-            discount=0.99,
-            cost_discount=0.98,
-            cost_limit=0.2,
-            initial_multiplier=5.0,
-            lagrangian_lr=0.0,
-            success_bonus=20.0,
-            initial_std=0.08,
-            final_std=0.05,
-            demonstration_noise=0.1,
-            guidance_weight=0.5,
-        )
-        return config, hparams, 8000
-    config = dataclasses.replace(config, scaling="world")
-    # where hovering over the last marker or the peg pays for ever, solving the task must pay more
-    if env == "table_wiping":
-        config = dataclasses.replace(config, total_steps=10_000_000)
-        return config, hparams.replace(success_bonus=50.0), 0
-    if env == "nut_assembly":
-        config = dataclasses.replace(config, total_steps=1_000_000)
-        return config, hparams.replace(success_bonus=100.0), 0
-    return PPOConfig(), PPOHParams(), 0
-
-
-def check(settings: ExpertSettings) -> None:
-    """Refuse what cannot work, before anything is built.
-
-    Raises:
-        UserError: One line naming field, value and what is allowed.
-    """
-    if not known(settings.env):
-        raise UserError(unknown(settings.env))
-    for name, least in (("seed", 0), ("training_scenarios", 0), ("evaluate_every", 1)):
-        value = getattr(settings, name)
-        if value < least:
-            raise UserError(f"{name} must be at least {least}, got {value}")
-    if settings.training_scenarios and settings.scenarios is not None:
-        raise UserError("training_scenarios is for generated scenarios: give it, or --scenarios")
-    try:
-        validate(settings.config, settings.hparams)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-
-
-def make_env_and_expert(settings: ExpertSettings) -> Env:
+def build_world(settings: ExpertSettings) -> Env:
     """The world that an expert trains in.
 
     Raises:
@@ -153,9 +58,9 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     """Train, evaluating and saving on the way; returns the summary.
 
     Args:
-        settings: Of the run.
+        settings: All that defines the run.
         out: Run folder.
-        resume: Go on from the folder's last checkpoint.
+        resume: Continue from the folder's last checkpoint.
 
     Raises:
         UserError: If settings or folder cannot be used.
@@ -163,24 +68,28 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     check(settings)
     began = time.perf_counter()
     config, folder = settings.config, RunFolder(out)
-    env = make_env_and_expert(settings)
+    env = build_world(settings)
     try:
         teacher = env.experts.get(env.card.expert.teacher)
         functions = make_ppo_lagrangian(env, config, expert=teacher)
     except ValueError as error:
         raise UserError(str(error)) from error
-    open_folder(folder, settings.as_json(), resume)
+    if resume:
+        before = read_settings(folder)
+        refuse_contradictions(out, one_level(before.as_json()), one_level(settings.as_json()))
+    else:
+        open_folder(folder, settings.as_json(), resume=False)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     done = 0
     if resume:
-        done, learner = restore_learner(folder, learner)
+        done, learner = _restore(folder, learner)
         folder.rewind(done, done)
         if done >= config.batches * config.batch_steps:
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
-    run = _Run(settings, folder, env, functions)
     first = done // config.batch_steps
     with Progress(config.batches * config.batch_steps, f"expert {settings.env}", done) as progress:
+        run = _Run(settings, folder, env, functions, progress)
         learner = run.start(learner, first)
         progress.start()
         for batch in range(first + 1, config.batches + 1):
@@ -190,35 +99,69 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     return run.finish(learner, time.perf_counter() - began)
 
 
+def _restore(folder: RunFolder, learner: PPOLearner) -> tuple[int, PPOLearner]:
+    """The newest whole checkpoint as (done, learner); (0, `learner`) if there is none.
+
+    A checkpoint from before config.json had a schema holds the settings that its version had, under
+    the names they had then.
+    """
+    content = folder.config()
+    if "schema" in content:
+        return restore_learner(folder, learner)
+    names = [(name, jax.Array) for name in content["hparams"]]  # in the order of the checkpoint
+    kind = flax.struct.dataclass(dataclasses.make_dataclass("HParamsThen", names))
+    zeros = kind(**{name: jax.numpy.zeros((), jax.numpy.float32) for name, _ in names})
+    like = dataclasses.replace(learner, hparams=zeros)
+    done, found = restore_learner(folder, like)
+    return done, dataclasses.replace(found, hparams=learner.hparams)
+
+
 class _Run:
     """The compiled batch of a run and what happens around it."""
 
     def __init__(
-        self, settings: ExpertSettings, folder: RunFolder, env: Env, functions: PPOFunctions
+        self,
+        settings: ExpertSettings,
+        folder: RunFolder,
+        env: Env,
+        functions: PPOFunctions,
+        progress: Progress,
     ):
         self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
+        self.progress = progress
         self.compile_s = self.train_s = 0.0
         self.trained = 0
 
     def start(self, learner: PPOLearner, first: int) -> PPOLearner:
         """Compile, and at the start of a run clone what it has demonstrated."""
-        began = time.perf_counter()
         jitted = jax.jit(lambda learner: self.functions.run(learner, 1), donate_argnums=0)
-        self.program = jitted.lower(learner).compile()
-        self.compile_s = time.perf_counter() - began
-        if first or not self.settings.config.demonstrations:
+        self.program = self._compiled(jitted, "a batch", learner)
+        config = self.settings.config
+        if first or not config.demonstrations:
             return learner
-        learner, metrics = jax.jit(self.functions.clone)(learner)
+        clone = self._compiled(jax.jit(self.functions.clone), "cloning", learner)
+        steps, updates = config.demonstrations, config.cloning_updates
+        self.progress.say(f"clones its teacher: {steps:,} steps shown, {updates:,} updates")
+        learner, metrics = clone(learner)
         row = {name: float(value) for name, value in metrics.items()}
         scores = self._evaluate(learner, 0)
         self.folder.append_metrics({"step": 0, "done": 0} | row | scores)
         checkpoint.save(self.folder.checkpoints, 0, learner)
         shown, success = row["clone/success_rate"], scores["eval/success_rate"]
-        print(f"clone: success {success:.2f} (demonstrated: {shown:.2f})", file=sys.stderr)
+        self.progress.say(f"the clone's success is {success:.2f} (its teacher's: {shown:.2f})")
         return learner
 
+    def _compiled(self, jitted: Any, part: str, learner: PPOLearner) -> Any:
+        """The program of a part of the run, compiled ahead of time and announced."""
+        config, began = self.settings.config, time.perf_counter()
+        what = f"PPO-Lagrangian in {self.settings.env}, {part}"
+        with self.progress.compiling(what, f"{what}, {config.num_envs} x {config.rollout_steps}"):
+            program = jitted.lower(learner).compile()
+        self.compile_s += time.perf_counter() - began
+        return program
+
     def batch(self, learner: PPOLearner, batch: int) -> tuple[PPOLearner, str | None]:
-        """One batch; every so many also evaluate and save, and say how it is going."""
+        """One batch; at every interval also an evaluation, a checkpoint and a note."""
         config = self.settings.config
         began = time.perf_counter()
         learner, metrics = jax.block_until_ready(self.program(learner))
@@ -255,21 +198,19 @@ class _Run:
         return {f"eval/{name}": value for name, value in summarise_episodes(rows).items()}
 
     def _save(self, learner: PPOLearner, step: int) -> None:
-        about = {"env": self.settings.env, "algorithm": "ppo_lagrangian"}
+        about = {"env": self.settings.env, "algorithm": ALGORITHM}
         about |= {"seed": self.settings.seed, "step": step}
         save_policy(self.folder.path / POLICY, self._policy(learner), about)
         checkpoint.save(self.folder.checkpoints, step, learner)
 
     def finish(self, learner: PPOLearner, wall_s: float) -> dict[str, Any]:
         """Write and return the summary."""
-        settings, steps = (
-            self.settings,
-            self.settings.config.batches * self.settings.config.batch_steps,
-        )
+        settings, config = self.settings, self.settings.config
+        steps = config.batches * config.batch_steps
         rows = read_evaluation(self.folder.path)
         summary = {
             "env": settings.env,
-            "algorithm": "ppo_lagrangian",
+            "algorithm": ALGORITHM,
             "seed": settings.seed,
             "total_steps": steps,
             **summarise_episodes([row for row in rows if row.step == steps]),

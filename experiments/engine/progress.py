@@ -58,6 +58,14 @@ class Progress:
         self.began += time.perf_counter() - began
         self._show(self.note)
 
+    def say(self, note: str) -> None:
+        """Show what is under way."""
+        self.note = note
+        if self.bar is not None:
+            self._show(note)
+        else:
+            print(f"{self.what}: {note}", file=sys.stderr, flush=True)
+
     def update(self, done: int, note: str) -> None:
         """`done` of the total are done."""
         self.done, self.note = done, note

@@ -28,7 +28,12 @@ from experiments.engine.progress import Progress
 from experiments.engine.recorded import recorded_functions, recording_of
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError, device, revision, versions
-from experiments.engine.settings import RunSettings, check, one_level
+from experiments.engine.settings import (
+    RunSettings,
+    check,
+    one_level,
+    refuse_contradictions,
+)
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.config import TrainConfig
 from ppl_jax.experts import SavedPolicy
@@ -202,13 +207,7 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
         except ValueError as error:
             raise UserError(str(error)) from error
         held, asked = one_level(before), one_level(json.loads(json.dumps(content)))
-        differing = [
-            f"{name} is {held.get(name)!r}, asked for {value!r}"
-            for name, value in asked.items()
-            if name != "schema" and held.get(name) != value
-        ]
-        if differing:
-            raise UserError(f"cannot resume {str(folder.path)!r}: its {'; its '.join(differing)}")
+        refuse_contradictions(folder.path, held, asked)
         return
     try:
         folder.create(

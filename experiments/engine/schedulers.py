@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.engine.runtime import UserError
+from experiments.engine.runtime import UserError, need
 from experiments.engine.worker import Job, Reply
 
 SERVE = "sweep-worker"  # the hidden command that a worker process is started with
@@ -130,13 +130,9 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
     Raises:
         UserError: If Ray is not installed or the cluster cannot be reached.
     """
-    try:
-        import ray
-        from ray.exceptions import RayError
-    except ImportError as error:
-        raise UserError(
-            "engine ray needs the package ray: pip install 'ppl-jax[ray]', or --engine local"
-        ) from error
+    ray = need("ray", "ray", "engine ray")
+    from ray.exceptions import RayError
+
     try:
         ray.init(address=address, log_to_driver=False, configure_logging=False)
     except (ConnectionError, RayError, RuntimeError, ValueError) as error:

@@ -134,6 +134,26 @@ def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
     return flat_content
 
 
+def refuse_contradictions(out: Any, held: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    """Check that a run is continued with its own settings.
+
+    Args:
+        out: Its folder.
+        held: Its settings, one level of names.
+        asked: Those that were asked for, one level of names.
+
+    Raises:
+        UserError: One line naming each that differs.
+    """
+    differing = [
+        f"{name} is {held.get(name)!r}, asked for {value!r}"
+        for name, value in asked.items()
+        if name != "schema" and held.get(name) != value
+    ]
+    if differing:
+        raise UserError(f"cannot resume {str(out)!r}: its {'; its '.join(differing)}")
+
+
 def _of_schema_1(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings in a config.json of the first version, under today's names.
 

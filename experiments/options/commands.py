@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, subcommand
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, arg, subcommand
 
 from experiments.options.seeds import Seeds
 
@@ -115,91 +115,9 @@ class Tune:
 
 @dataclasses.dataclass
 class ExpertTrain:
-    """Train a neural expert by PPO-Lagrangian: progress, then the evaluation table; a run folder.
+    """Train a neural expert by PPO-Lagrangian: progress, then its evaluation; a run folder."""
 
-    Defaults are those of the world's shipped expert.
-    """
-
-    env: Positional[str]
-    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
-    seed: int = 0
-    """Random seed."""
-    total_steps: int | None = None
-    """Environment steps."""
-    num_envs: int | None = None
-    """Worlds stepped side by side."""
-    rollout_steps: int | None = None
-    """Steps of each world per batch."""
-    epochs: int | None = None
-    """Passes over a batch."""
-    num_minibatches: int | None = None
-    """Updates per pass."""
-    hidden: tuple[int, ...] | None = None
-    """Widths of the hidden layers of policy and critics."""
-    scaling: Literal["running", "world"] | None = None
-    """Inputs are scaled by running statistics, or by the world's constants."""
-    demonstrations: int | None = None
-    """Steps that the scripted expert labels, under noise, and that the policy clones first."""
-    demonstration_stride: int | None = None
-    """Of these every so many are kept."""
-    demonstration_rounds: int | None = None
-    """Rounds of these: the expert plays the first, the clone the others."""
-    cloning: Literal["laplace", "gaussian"] | None = None
-    """Likelihood that is cloned: for the median or the mean of what the expert does."""
-    cloning_updates: int | None = None
-    """Updates of that."""
-    demonstration_noise: float | None = None
-    """Standard deviation of that noise."""
-    guided: bool | None = None
-    """The expert also says at every step of the training what it would do."""
-    guidance_weight: float | None = None
-    """Of the distance from that."""
-    critic_batches: int | None = None
-    """Batches at the start in which only the critics learn."""
-    learning_rate: float | None = None
-    """Of Adam; falls linearly to 0."""
-    discount: float | None = None
-    """gamma of the reward."""
-    cost_discount: float | None = None
-    """gamma of the cost."""
-    gae_lambda: float | None = None
-    """lambda of the generalised advantages."""
-    clip: float | None = None
-    """PPO's bound on the ratio."""
-    target_kl: float | None = None
-    """KL at which a batch's policy updates stop."""
-    max_grad_norm: float | None = None
-    """Norm to which gradients are clipped."""
-    entropy_coef: float | None = None
-    """Weight of the policy's entropy."""
-    cost_limit: float | None = None
-    """Mean cost per episode that is allowed."""
-    terminate_on_cost: float | None = None
-    """1 where nothing is worth anything after a step that costs, 0 otherwise."""
-    initial_multiplier: float | None = None
-    """Of the cost, at the start."""
-    lagrangian_lr: float | None = None
-    """Adam's rate for the multiplier."""
-    initial_std: float | None = None
-    """Standard deviation of the actions at the start."""
-    min_std: float | None = None
-    """Standard deviation of the actions at least."""
-    final_std: float | None = None
-    """Bound on it at the end."""
-    success_bonus: float | None = None
-    """Reward for solving the task, while training."""
-    training_scenarios: int | None = None
-    """Generated scenarios to train on, numbered from 10,000; 0 for the novice's."""
-    scenarios: str | None = None
-    """Folder of recorded scenarios to train on."""
-    held_out_scenarios: str | None = None
-    """Folder of recorded scenarios to evaluate on (default: those of --scenarios)."""
-    evaluate_every: int | None = None
-    """Batches between evaluations and checkpoints (default: a fortieth of the run)."""
-    out: Path | None = None
-    """Run folder (default: runs/ENV-expert-SEED-TIME)."""
-    resume: bool = False
-    """Go on with the run in --out."""
+    # its options are generated when it is asked for: see `experiments.options.expert`
 
 
 @dataclasses.dataclass
@@ -282,16 +200,26 @@ class Robustness(Sweep):
     """Folder of the result files; finished runs in it are kept."""
 
 
-@dataclasses.dataclass
-class Expert:
-    """Train, evaluate or describe an expert."""
+def expert_command(train: type) -> type:
+    """The class of `ppl expert`.
 
-    command: OmitSubcommandPrefixes[
-        Annotated[ExpertTrain, subcommand("train")]
-        | Annotated[ExpertEvaluate, subcommand("evaluate")]
-        | Annotated[ExpertCard, subcommand("card")]
-    ]
-    """What to do."""
+    Args:
+        train: Class of its `train`.
+    """
+    parts: tuple[Any, ...] = (
+        Annotated[train, subcommand("train")],
+        Annotated[ExpertEvaluate, subcommand("evaluate")],
+        Annotated[ExpertCard, subcommand("card")],
+    )
+    command = parts[0] | parts[1] | parts[2]
+    made = dataclasses.make_dataclass(
+        "Expert", [("command", Annotated[OmitSubcommandPrefixes[command], arg(name="")])]
+    )
+    made.__doc__ = "Train, evaluate or describe an expert."
+    return made
+
+
+Expert = expert_command(ExpertTrain)
 
 
 @dataclasses.dataclass

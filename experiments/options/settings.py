@@ -47,6 +47,12 @@ def words_after(argv: Sequence[str], option: str) -> list[str]:
     return found
 
 
+def is_given(argv: Sequence[str], option: str) -> bool:
+    """Whether a command line names an option, `--option=value` and `--an_option` included."""
+    names = (word.partition("=")[0] for word in argv if word.startswith("--"))
+    return any(name.replace("_", "-") == option for name in names)
+
+
 def environments_in(argv: Sequence[str]) -> list[str]:
     """The known environments that a command line names."""
     return [word for word in argv if not word.startswith("-") and known(word)]
@@ -88,19 +94,36 @@ def settings_in(argv: Sequence[str], *, sweeping: bool = False) -> dict[str, Set
     return found
 
 
-def refuse_old_names(argv: Sequence[str]) -> None:
+def refuse_old_names(
+    argv: Sequence[str],
+    names: Mapping[str, str] = RENAMED,
+    values: Mapping[str, Mapping[str, str]] = RENAMED_VALUES,
+) -> None:
     """Refuse settings and values under the names they had before.
+
+    Args:
+        argv: A command line.
+        names: New names of settings by their old ones.
+        values: For a setting the new names of its values by their old ones.
 
     Raises:
         UserError: One line with the new name.
     """
-    for old, new in RENAMED.items():
-        if word_after(argv, f"--{old.replace('_', '-')}") is not None:
+    for old, new in names.items():
+        if is_given(argv, f"--{old.replace('_', '-')}"):
             raise UserError(f"{old} is called {new} now: give --{new.replace('_', '-')}")
-    for name, renamed in RENAMED_VALUES.items():
+    for name, renamed in values.items():
         for value in words_after(argv, f"--{name.replace('_', '-')}"):
             if value in renamed:
                 raise UserError(f"{name} {value!r} is called {renamed[value]!r} now")
+
+
+def shows_everything(argv: Sequence[str]) -> bool:
+    """Whether options that are not common are there too.
+
+    Only `--help` leaves them out: what help hides could not be given either.
+    """
+    return HELP_ALL in argv or not {"-h", "--help"} & set(argv)
 
 
 def choices_of(setting: Setting) -> tuple[str, ...] | None:
@@ -121,21 +144,24 @@ def kind_of(setting: Setting) -> Any:
     return Union[kind, names] if kind in (int, float) else names  # noqa: UP007
 
 
-def option_fields(settings: Mapping[str, Setting], *, everything: bool) -> dict[str, list[Any]]:
+def option_fields(
+    settings: Mapping[str, Setting], *, everything: bool, groups: Sequence[str] = GROUPS
+) -> dict[str, list[Any]]:
     """For each group the fields of its dataclass: one option a setting, with its true value.
 
     Args:
         settings: By name.
-        everything: Whether help shows all of them, or the common ones alone.
+        everything: Whether all of them are there, or the common ones alone.
+        groups: Names of the groups.
     """
-    groups: dict[str, list[Any]] = {group: [] for group in GROUPS}
+    fields: dict[str, list[Any]] = {group: [] for group in groups}
     for name, one in settings.items():
         told = tyro.conf.arg(help=one.about.help)
         kind: Any = Annotated[kind_of(one), told]
         if not (one.about.common or everything):
             kind = Annotated[kind_of(one), told, tyro.conf.Suppress]
-        groups[one.about.group].append((name, kind, dataclasses.field(default=one.value)))
-    return groups
+        fields[one.about.group].append((name, kind, dataclasses.field(default=one.value)))
+    return fields
 
 
 def axis_fields(settings: Mapping[str, Setting], *, everything: bool) -> list[Any]:

@@ -24,6 +24,7 @@ from experiments.options.settings import (
     environments,
     option_fields,
     settings_in,
+    shows_everything,
     word_after,
 )
 from ppl_jax.config import PRESETS, Setting, TrainConfig
@@ -73,7 +74,7 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     Raises:
         UserError: If the command line names an unknown method, gate, predictor or preset.
     """
-    everything = HELP_ALL in argv
+    everything = shows_everything(argv)
     own = {name: default for group in _OWN.values() for name, _, default, _ in group}
     settings = settings_in(argv)
     before = _before(argv)
@@ -108,7 +109,10 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
             part = dataclasses.make_dataclass(group, fields)
             members.append((group, OmitArgPrefixes[part], dataclasses.field(default_factory=part)))
     made = dataclasses.make_dataclass("Train", members)
-    made.__doc__ = "Train one policy: progress, then the evaluation table; a run folder."
+    made.__doc__ = (
+        "Train one policy: progress, then the evaluation table; a run folder. "
+        f"{HELP_ALL} shows every option."
+    )
     return made, defaults
 
 

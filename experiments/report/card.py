@@ -17,9 +17,10 @@ from experiments.engine.evaluate import (
     read_evaluation,
     summarise_episodes,
 )
-from experiments.engine.expert import settings_for
+from experiments.engine.expert_settings import read_settings
 from experiments.engine.run_folder import METRICS, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
+from experiments.options.expert import command_of
 from experiments.report.tables import write_rows
 
 TRAINING = ("episodic_return", "episodic_cost", "success_rate", "multiplier", "action_std")
@@ -37,13 +38,11 @@ def write_card(run: Path, out: Path, *, force: bool = False) -> None:
         UserError: If the run is none of an expert, or has not finished, or a file would be lost.
     """
     folder = RunFolder(run)
-    try:
-        config = folder.config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    if config["algorithm"] != "ppo_lagrangian" or not (run / SUMMARY).is_file():
-        raise UserError(f"{str(run)!r} is no finished run of `ppl expert train`")
-    summary, env = folder.read_json(SUMMARY), config["env"]
+    settings = read_settings(folder)
+    if not (run / SUMMARY).is_file():
+        raise UserError(f"{str(run)!r} has not finished: ppl expert train --resume --out {run}")
+    config = folder.config()
+    summary, env = folder.read_json(SUMMARY), settings.env
     rows = read_evaluation(run)
     refuse_to_overwrite(out, env, force=force)
     out.mkdir(parents=True, exist_ok=True)
@@ -54,18 +53,18 @@ def write_card(run: Path, out: Path, *, force: bool = False) -> None:
     card = {
         "world": env,
         "policy": f"{env}.npz",
-        "command": command_of(config),
+        "command": command_of(settings),
         "date": time.strftime("%Y-%m-%d", time.gmtime((run / SUMMARY).stat().st_mtime)),
-        "seed": config["seed"],
+        "seed": settings.seed,
         "steps": summary["total_steps"],
-        "demonstrations": config["config"]["demonstrations"],
+        "demonstrations": settings.config.demonstrations,
         "held_out": {name: round(value, 4) for name, value in last.items()},
         f"held_out_at_{rows[0].step}_steps": {n: round(v, 4) for n, v in first.items()},
         "curve": f"{env}.csv",
         "hours": round(summary["wall_s"] / 3600, 2),
         "steps_per_s": summary["steps_per_s"],
-        "config": config["config"],
-        "hparams": config["hparams"],
+        "config": dataclasses.asdict(settings.config),
+        "hparams": {k: float(v) for k, v in dataclasses.asdict(settings.hparams).items()},
         "device": config["device"],
         "versions": config["versions"],
         "revision": config["revision"],
@@ -104,22 +103,6 @@ def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:
         table.append(line)
         before = step
     return table
-
-
-def command_of(config: dict[str, Any]) -> str:
-    """The command line that makes a run again, given the defaults of this version."""
-    words = ["ppl", "expert", "train", config["env"]]
-    static, traced, training = settings_for(config["env"])
-    defaults = {**dataclasses.asdict(static), **dataclasses.asdict(traced), "seed": 0}
-    defaults |= {"training_scenarios": training, "scenarios": None, "held_out_scenarios": None}
-    given = config | config["config"] | config["hparams"]
-    for name, default in defaults.items():
-        value = given.get(name, default)
-        value = tuple(value) if isinstance(value, list) else value
-        if value != default:
-            shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            words += [f"--{name.replace('_', '-')}", shown]
-    return " ".join(words)
 
 
 def read_curve(path: Path) -> list[dict[str, float]]:

@@ -218,6 +218,8 @@ def read_frame(path: Path) -> Frame:
         raise UserError(
             f"{str(path)!r} holds no results of ppl train, sweep, compare, ablation or tune"
         )
+    if "step" not in frame and "total_steps" in frame:
+        frame["step"] = frame["total_steps"]
     for name, value in {"env": "", "algorithm": named, "seed": "0", "step": "0"}.items():
         if name not in frame:
             frame[name] = value

@@ -18,7 +18,7 @@ from ppl_jax.interaction import Learner
 from ppl_jax.training import make_train
 
 if TYPE_CHECKING:
-    from experiments.cli import Horizon
+    from experiments.options.commands import Horizon
 
 MEASUREMENTS = 5  # over a run, unless asked for otherwise
 

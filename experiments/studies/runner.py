@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs.registry import known, unknown
+from experiments.engine import compile_log
 from experiments.engine import schedulers as engines
 from experiments.engine.files import write_text_atomic
 from experiments.engine.progress import Progress
@@ -42,7 +43,7 @@ from ppl_jax.cards import card
 from ppl_jax.config import did_you_mean, values
 
 if TYPE_CHECKING:
-    from experiments.cli import Sweep
+    from experiments.options.commands import Sweep
 
 SETTINGS = "sweep.json"
 LOG = "workers.log"
@@ -79,7 +80,7 @@ def plan(command: Sweep) -> list[Run]:
         for algorithm in _algorithms(command):
             for chosen in _points(command, env, algorithm):
                 for seed in command.seeds:
-                    settings = _settings(command, env, algorithm, chosen, seed)
+                    settings = _settings(command, env, algorithm, chosen, seed=seed)
                     if settings is not None:
                         name = run_name(env, algorithm, chosen, seed)
                         runs.append(Run(name, tuple(chosen.items()), settings))
@@ -128,7 +129,7 @@ def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
 
 
 def _settings(
-    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], seed: int
+    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], *, seed: int
 ) -> RunSettings | None:
     """Of one run; None where a study's L exceeds what the world predicts."""
     given = dict(chosen)
@@ -218,8 +219,13 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
     failed = {}
     with Progress(len(runs), "runs", len(done)) as progress:
         progress.start()
+        if jobs:
+            first = compile_log.phrase(*_program(jobs[0][1][0]))
+            progress.say(f"{first}; the first run of each program compiles")
         for number, reply in _engine(execution, [job for job, _ in jobs], out / LOG):
             compiling = reply.get("compile_s", 0.0) / _workers(execution)
+            if compiling:
+                compile_log.remember(_program(jobs[number][1][0])[1], reply["compile_s"])
             progress.began += compiling  # says nothing of what is left
             for run, rows in _replies(reply, jobs[number], runs):
                 if isinstance(rows, str):
@@ -236,6 +242,13 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
             f"{len(failed)} of {len(runs)} runs failed (the same command tries them again); "
             f"{name}: {why}"
         )
+
+
+def _program(run: Run) -> tuple[str, str]:
+    """What the program of a run is called, for people and in the log of compile times."""
+    settings = run.settings
+    name = f"{settings.algorithm} in {settings.env}"
+    return name, f"sweep: {name}, {settings.config.total_steps} steps"
 
 
 def policy_name(run: str) -> str:

@@ -69,12 +69,21 @@ PIECES = (
     Piece(
         "dev",
         "tests, static checks and notebooks",
-        ("pytest", "xdist", "pytest_timeout", "hypothesis", "importlinter", "pyright", "nbclient",
-         "ipykernel", "playwright"),
-        ("ruff",),
+        (
+            "pytest",
+            "xdist",
+            "pytest_timeout",
+            "hypothesis",
+            "importlinter",
+            "pyright",
+            "nbclient",
+            "ipykernel",
+            "playwright",
+            "ruff",
+        ),
     ),
     Piece("chromium", "tests in the browser", (), BROWSERS, "apt-get install -y chromium"),
-)  # fmt: skip
+)
 
 
 def doctor() -> None:

@@ -27,7 +27,7 @@ GAIL_STEPS = 1_000_000
 
 
 def _bc(card: EnvCard) -> Mapping[str, Any]:
-    steps = card.demonstrations  # what the paper gives methods that learn from them alone
+    steps = card.demonstrations  # the paper's number for methods that learn from them alone
     return {
         "total_steps": steps,
         "demonstrations": steps,
@@ -56,7 +56,8 @@ def _thrifty(card: EnvCard) -> Mapping[str, Any]:
 
 # `tuned` is the best of four settings each, found by `ppl tune driving --seeds 1` on training
 # scenarios after 3,000 steps (experiments/results/driving_tuning.csv), and used in every
-# environment. `grid` is what was tried: two learning rates by two values of what matters most.
+# environment. `grid` holds the values tried: two learning rates by two values of the setting that
+# matters most.
 _CRITICS = {"batch_size": BATCH_OF_CRITICS}
 _VALUES_ALONE = {**_CRITICS, "bc_weight": 0.0}  # no cloning term in the published losses
 _LIKELIHOOD = {"likelihood": ("gaussian", "laplace")}

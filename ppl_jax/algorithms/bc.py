@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
 from ppl_jax.gates import never
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Network, layers, make_policy
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
@@ -102,8 +103,8 @@ def make_cloner(
         L = -E_{D_h}[ log pi(a_h|s) ]
 
     Args:
-        name: Of the method.
-        spec: Of the environment.
+        name: The method's name.
+        spec: The environment's sizes and scales.
         config: Static settings.
         decide: See `Algorithm.decide`.
     """

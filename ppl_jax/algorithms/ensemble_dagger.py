@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Ensemble, ensemble_layers, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
@@ -98,10 +99,10 @@ def members_loss(
     """Sum of the members' cloning losses, each on a batch of its own.
 
     Args:
-        params: Of the ensemble.
+        params: The ensemble's.
         observation, action: [K, B, O], [K, B, A].
         weight: [K, B].
-        ensemble: Of K members.
+        ensemble: K members.
         config: Static settings.
     """
     mean = ensemble.each(params, observation)

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.fields import setting
 from ppl_jax.gates import never
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy, make_raw
 from ppl_jax.ppo.losses import advantages, clipped_loss
@@ -78,8 +79,8 @@ class GAILLearned:
 
     Attributes:
         policy: `Learned` of {"mean": network, "log_std": [A]}.
-        value: Of the state value.
-        discriminator: Of the logit of D, the probability that (s, a) is the expert's.
+        value: `Learned` of the state value.
+        discriminator: `Learned` of the logit of D, the probability that (s, a) is the expert's.
     """
 
     policy: Learned
@@ -214,7 +215,7 @@ class PPOBatch(NamedTuple):
 
     Attributes:
         observation, action: [B, O], [B, A].
-        log_prob: Of the actions when they were made.
+        log_prob: Log-density of the actions when they were made.
         advantage: Normalised.
         returns: Targets of the value.
     """
@@ -231,13 +232,20 @@ def ppo_batch(
     steps: OnPolicyStep,
     reward: jax.Array,
     discount: jax.Array | float,
+    *,
     networks: Networks,
 ) -> PPOBatch:
     """A whole rollout [T] with its advantages, from rewards [T]."""
     before = networks.value.apply(learned.value.params, steps.observation)[..., 0]
     after = networks.value.apply(learned.value.params, steps.next_observation)[..., 0]
     advantage = advantages(
-        reward, before, after, steps.terminated, steps.done, discount, GAE_LAMBDA
+        reward,
+        before,
+        after,
+        steps.terminated,
+        done=steps.done,
+        discount=discount,
+        gae_lambda=GAE_LAMBDA,
     )
     returns = advantage + before
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -271,7 +279,7 @@ def improve(
     networks: Networks,
     batch_size: int,
 ) -> tuple[GAILLearned, jax.Array]:
-    """PPO's epochs over one rollout: what was learned, and the mean loss of the value."""
+    """PPO's epochs over one rollout: all that was learned, and the mean loss of the value."""
     count = rollout.action.shape[0]
     batches = max(count // batch_size, 1)
 
@@ -307,7 +315,7 @@ def update(
     novice_logit = logit(disc.params, steps.observation, steps.action, networks)
     reward = imitation_reward(novice_logit, hparams.method.survival_correction)
     learned = dataclasses.replace(state.learned, discriminator=disc)
-    rollout = ppo_batch(learned, steps, reward, hparams.method.discount, networks)
+    rollout = ppo_batch(learned, steps, reward, hparams.method.discount, networks=networks)
     learned, loss_value = improve(
         learned,
         rollout,

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss, td_target
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import squashed_gaussian
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Layers, Network, layers, make_critic, make_raw
 from ppl_jax.types import EnvSpec, Interaction
@@ -57,9 +58,9 @@ class HACOLearned:
 
     Attributes:
         actor: `Learned` of a squashed Gaussian: its network gives mean and log standard deviation.
-        value: Of twin proxy values Q, with target networks.
-        cost: Of twin values Q_int of the intervention cost, with target networks.
-        log_alpha: Of the entropy's temperature.
+        value: `Learned` of twin proxy values Q, with target networks.
+        cost: `Learned` of twin values Q_int of the intervention cost, with target networks.
+        log_alpha: `Learned` of the logarithm of the entropy's temperature.
     """
 
     actor: Learned

@@ -1,4 +1,4 @@
-"""HG-DAgger (Kelly et al. 2019): clone what the expert does while it is in control."""
+"""HG-DAgger (Kelly et al. 2019): clone the expert while it is in control."""
 
 from __future__ import annotations
 

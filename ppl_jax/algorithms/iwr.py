@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Network, layers, make_policy
 from ppl_jax.types import EnvSpec, Interaction

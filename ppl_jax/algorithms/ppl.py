@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax import buffers, horizon
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import (
     NEEDS_REFERENCE,
     Metrics,
@@ -273,7 +274,7 @@ def ppl_loss(
     """bc_weight L_bc + preference_weight L_pref of one batch from either data set.
 
     Args:
-        params: Of the policy.
+        params: The policy's.
         cloned: Observations [B, O] and expert actions [B, A].
         pairs: [B].
         has_pairs: 0 while there are none, else 1.
@@ -342,7 +343,7 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
         L = preference_weight L_pref + bc_weight L_bc                    (see `ppl_jax.losses`)
 
     Args:
-        spec: Of the environment.
+        spec: The environment's sizes and scales.
         config: Static settings; `objective`, `preferred`, `rejected` and `pair_states` make the
             ablations.
         reference: Reference policy of the objectives that have one.

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import ActorCritic, Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss, td_target
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.distributions import log_likelihood
 from ppl_jax.fields import setting
+from ppl_jax.learned import ActorCritic, Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy
 from ppl_jax.types import EnvSpec, Interaction
@@ -105,6 +106,7 @@ def smoothed_target(
     batch: ReplayStep,
     key: jax.Array,
     discount: jax.Array | float,
+    *,
     networks: Networks,
 ) -> jax.Array:
     """TD3's target (Fujimoto et al. 2018): the target policy's action with clipped noise, [B]."""
@@ -154,7 +156,9 @@ def update(
     batch, weight = buffers.sample_split(state.replay, key_batch, config.batch_size)
     has_data = buffers.size(state.replay.human) > 0
     actor, critics = state.learned.actor, state.learned.critic
-    target = smoothed_target(state.learned, batch, key_noise, hparams.method.discount, networks)
+    target = smoothed_target(
+        state.learned, batch, key_noise, hparams.method.discount, networks=networks
+    )
     loss = functools.partial(critic_loss, critic=networks.critic)
     grads, metrics = jax.grad(loss, has_aux=True)(critics.params, batch, target, weight)
     critics = adam_step(

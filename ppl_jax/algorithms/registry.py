@@ -151,7 +151,7 @@ def settings(
     """The settings of a run: the preset's for the environment, the method's own, those given.
 
     Args:
-        name: Of the method.
+        name: The method's name.
         env: Name of the environment.
         preset: "default", "paper" or "reference".
         **given: Settings by their flat names; `gate` and `predictor` decide which further ones

@@ -43,7 +43,7 @@ def td_target(
     """Target y = paid + gamma (1 - terminated) (min_k Q'_k + entropy), [K, B] -> [B].
 
     Args:
-        next_values: Of the target networks at (s', a').
+        next_values: The target networks' at (s', a').
         terminated: Not where an episode was cut off by time.
         discount: gamma.
         paid: Reward or cost of the step, [B]; there is no reward here.

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax import buffers
-from ppl_jax.algorithms.base import Algorithm, Learned, adam_step, init_learned
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.ensemble_dagger import (
     Bootstrap,
     add_human,
@@ -23,6 +23,7 @@ from ppl_jax.algorithms.ensemble_dagger import (
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Ensemble, Network, ensemble_layers, make_critic, make_ensemble
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction

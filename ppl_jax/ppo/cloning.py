@@ -15,8 +15,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.distributions import log_likelihood
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.ppo.losses import RunningStats, mean_of_ended
 from ppl_jax.ppo.rollout import (

@@ -14,6 +14,8 @@ import flax.struct
 import jax
 import numpy as np
 
+from ppl_jax.checks import did_you_mean
+from ppl_jax.config import Setting, settings_of
 from ppl_jax.fields import About, about, setting
 
 POSITIVE = float(np.finfo(np.float32).tiny)  # least value of a field that must not be 0
@@ -164,7 +166,7 @@ class PPOConfig:
     )
     demonstrations: int = setting(
         0,
-        "Steps that the scripted expert labels under noise and that the policy clones first.",
+        "Steps that a scripted expert labels under noise and that the policy clones first.",
         low=0,
         group="demonstrations",
         common=True,
@@ -253,19 +255,34 @@ def _check_range(name: str, value: Any, field: About) -> None:
         raise ValueError(f"{name} must {allowed(field, isinstance(value, int))}, got {value}")
 
 
-def read(config: Mapping[str, Any], hparams: Mapping[str, Any]) -> tuple[PPOConfig, PPOHParams]:
-    """Settings from a run folder's config.json or a card, old names included.
+def catalogue(config: PPOConfig, hparams: PPOHParams) -> dict[str, Setting]:
+    """Every setting of a run by its name, in the order of the classes."""
+    return settings_of(config, traced=False) | settings_of(hparams, traced=True)
+
+
+def replace(config: PPOConfig, hparams: PPOHParams, **changes: Any) -> tuple[PPOConfig, PPOHParams]:
+    """The settings with some of them changed by name.
+
+    Raises:
+        ValueError: If a name is no setting of PPO-Lagrangian.
+    """
+    known = catalogue(config, hparams)
+    if unknown := sorted(set(changes) - set(known)):
+        raise ValueError(
+            f"unknown settings of PPO-Lagrangian: {', '.join(unknown)}"
+            + did_you_mean(unknown[0], known)
+        )
+    static = {name: value for name, value in changes.items() if not known[name].traced}
+    traced = {name: value for name, value in changes.items() if known[name].traced}
+    return dataclasses.replace(config, **static), dataclasses.replace(hparams, **traced)
+
+
+def read(settings: Mapping[str, Any]) -> tuple[PPOConfig, PPOHParams]:
+    """Settings by name from a run folder or a card, old names included; the rest are defaults.
 
     Raises:
         ValueError: One line naming what is unknown.
     """
-    records = []
-    for kind, content in ((PPOConfig, config), (PPOHParams, hparams)):
-        known = {field.name for field in dataclasses.fields(kind)}
-        values = {OLD_NAMES.get(name, name): value for name, value in content.items()}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"unknown settings of PPO-Lagrangian: {', '.join(unknown)}")
-        if "hidden" in values:
-            values["hidden"] = tuple(values["hidden"])
-        records.append(kind(**values))
-    return records[0], records[1]
+    values = {OLD_NAMES.get(name, name): value for name, value in settings.items()}
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return replace(PPOConfig(), PPOHParams(), **values)

@@ -38,9 +38,9 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.algorithms.base import Learned, adam_step, init_learned
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.experts import SavedPolicy
+from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import layers
 from ppl_jax.ppo.cloning import clone
@@ -334,7 +334,7 @@ def iterate(problem: Problem, learner: PPOLearner, _: None) -> tuple[PPOLearner,
     learned = dataclasses.replace(
         before,
         multiplier=update_multiplier(
-            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known
+            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known=known
         ),
     )
     learned, batch, metrics = prepare(problem, learned, steps, hparams)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ppl_jax.algorithms.base import Learned
+from ppl_jax.learned import Learned
 from ppl_jax.networks import Network, make_policy, make_raw
 from ppl_jax.ppo.config import PPOConfig, PPOHParams
 from ppl_jax.ppo.losses import Multiplier, RunningStats

@@ -537,9 +537,14 @@ def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
     longer = dataclasses.replace(CONFIG, total_steps=400)
     with pytest.raises(UserError, match="total_steps must not exceed the recording's 300, got 400"):
         train(dataclasses.replace(settings, config=longer), tmp_path / "run")
-    rounds = dataclasses.replace(CONFIG, rollout_steps=100)
+    rounds, hparams = plain_settings(
+        "gail", total_steps=300, hidden=(16,), decision_interval=5, rollout_steps=100
+    )
     with pytest.raises(UserError, match="gail plays by itself"):
-        train(dataclasses.replace(settings, algorithm="gail", config=rounds), tmp_path / "run")
+        train(
+            dataclasses.replace(settings, algorithm="gail", config=rounds, hparams=hparams),
+            tmp_path / "run",
+        )
     with pytest.raises(UserError, match=r"is of probe, not of driving"):
         length_of(session, "driving")
     assert not (tmp_path / "run").exists()

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from ppl_jax import algorithms, buffers, checkpoint
-from ppl_jax.algorithms import eil, gail, haco, pvp, replay, thrifty_dagger
+from ppl_jax.algorithms import eil, gail, haco, ppl, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
 from ppl_jax.config import HParams
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.experts import SavedPolicy, act
-from ppl_jax.networks import ensemble_layers, make_ensemble
+from ppl_jax.networks import Network, ensemble_layers, make_critic, make_ensemble, make_policy
 from ppl_jax.training import make_train, phases
-from tests.helpers import OWN, Balance, Goal, Probe, probe_settings
+from ppl_jax.types import PreferenceBatch
+from tests.helpers import OWN, Balance, Goal, Probe, plain_settings, probe_settings
 
 RNG = np.random.default_rng(1)
 B, K, A = 6, 2, 3
@@ -188,6 +189,52 @@ def test_gail_losses():
         np.testing.assert_allclose(gail.imitation_reward(ours, correction), expected, rtol=1e-4)
 
 
+def test_ppl_sums_both_losses_by_their_weights():
+    """With the terms one by one; without pairs only cloning is left."""
+    config, hparams = plain_settings("ppl", beta=0.3, bc_weight=0.7, preference_weight=2.0)
+    policy = Network(init=lambda key: None, apply=lambda params, observation: params + observation)
+    means, expert, good, bad = (uniform(B, A) for _ in range(4))
+    pairs = PreferenceBatch(
+        observation=means, preferred_action=good, rejected_action=bad, rejected_observation=None
+    )
+    bc = np.mean(np.sum((means - expert) ** 2, -1))
+    delta = -np.sum((means - good) ** 2, -1) + 0.5 * np.sum((means - bad) ** 2, -1)
+    preference = np.mean(np.log1p(np.exp(-0.3 * delta)))
+    for has_pairs in (0.0, 1.0):
+        loss, _ = ppl.ppl_loss(
+            0.0,
+            (means, expert),
+            pairs,
+            jnp.float32(has_pairs),
+            hparams=hparams,
+            policy=policy,
+            config=config,
+        )
+        expected = 0.7 * bc + 2.0 * has_pairs * preference
+        assert float(loss) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_loss_of_a_method_refuses_shapes_that_do_not_fit():
+    """Each would broadcast to a number that means nothing."""
+    batch, both, column = np.zeros(B), np.zeros((K, B)), np.zeros((B, 1))
+    for call in (
+        lambda: pvp.proxy_value_loss(both, both, column, batch),
+        lambda: pvp.policy_loss(batch, column, batch, batch, bc_weight=1.0),
+        lambda: replay.td_target(both, column, 0.9),
+        lambda: replay.td_target(both, batch, 0.9, paid=column),
+        lambda: replay.td_loss(both, column, batch),
+        lambda: replay.td_loss(both.T, batch, batch),
+        lambda: haco.proxy_loss(both, both, batch, column, weight=batch, conservative_weight=1.0),
+        lambda: haco.policy_loss(batch, both, both.T, 1.0, weight=batch),
+        lambda: haco.intervention_cost(column, batch),
+        lambda: eil.hinge_losses(both, column, both, both[:, None], distance=both, margin=0.1),
+        lambda: gail.discriminator_loss(batch, column),
+        lambda: thrifty_dagger.risk_target(batch, batch, column),
+    ):
+        with pytest.raises(AssertionError, match=r"shape|rank|broadcast"):
+            call()
+
+
 # --- networks and data ---
 
 
@@ -344,6 +391,31 @@ def test_balanced_batches():
     items, weight = buffers.sample_both(split, jax.random.key(0), 4000)
     np.testing.assert_array_equal(weight, np.ones(4000))
     assert np.mean(np.asarray(items) == 7) == pytest.approx(0.25, abs=0.03)
+
+
+def test_batches_of_eil_and_thrifty_dagger():
+    """The novice's half of a batch weighs nothing while it is empty; solved steps get a share."""
+    config, _ = probe_settings("eil")
+    spec, key = Probe().spec, jax.random.key(0)
+    networks = eil.Networks(make_policy(spec, (4,)), make_critic(spec, (4,), 2))
+    state = eil.init_state(key, networks, spec, config)
+    batch = eil.sample_batch(state, key, 4)
+    assert float(batch.weight) == 0.0
+    assert batch.others.shape == (eil.OTHERS + 1, 4, spec.action_size)
+    labelled = jax.tree.map(lambda leaf: leaf[:1], state.robot_buffer.data)
+    robot = buffers.add(state.robot_buffer, labelled, jnp.ones(1, bool))
+    state = dataclasses.replace(state, robot_buffer=robot)
+    assert float(eil.sample_batch(state, key, 4).weight) == 1.0
+
+    config, _ = probe_settings("thrifty_dagger")
+    networks = thrifty_dagger.Networks(make_ensemble(spec, (4,), 3), make_critic(spec, (4,), 2))
+    state = thrifty_dagger.init_state(key, networks, spec, config)
+    row = jax.tree.map(lambda leaf: leaf[:1], state.steps.data)
+    goal = dataclasses.replace(row, success=jnp.ones(1, bool))
+    state = dataclasses.replace(state, steps=buffers.add(state.steps, row, jnp.ones(1, bool)))
+    assert not np.any(thrifty_dagger.sample_steps(state, key, key, 20).success)
+    state = dataclasses.replace(state, goals=buffers.add(state.goals, goal, jnp.ones(1, bool)))
+    assert int(np.sum(thrifty_dagger.sample_steps(state, key, key, 20).success)) == 2
 
 
 @pytest.mark.parametrize("which", ["preferred", "rejected"])

@@ -113,7 +113,7 @@ def test_a_profile_of_a_world_that_is_known():
     """The expert says the same at every predicted state of an episode: nothing drifts."""
     config, hparams = probe_settings("ppl", max_preference_horizon=6)
     profile = horizon.make_profile(
-        Probe(), Probe.scripted_expert, config, worlds=4, steps=60, visited=50, kept=20
+        Probe(), Probe.scripted_expert, config, num_envs=4, steps=60, visited=50, kept=20
     )
     found = jax.jit(lambda key: profile(key, lambda observation: jnp.zeros(1), hparams))(
         jax.random.key(0)

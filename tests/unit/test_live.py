@@ -39,10 +39,10 @@ def live(algorithm="ppl", **changes):
     return probe, fns
 
 
-def session(probe, fns, steps, seed=0):
+def session(probe, fns, steps, seed=0, hparams=HP):
     """Somebody who takes over where the prediction would fail, and knows what to do."""
     predict_path, play, learn = jax.jit(fns.predict_path), jax.jit(fns.play), jax.jit(fns.learn)
-    learner, rows, takeover = jax.jit(fns.init)(jax.random.key(seed), HP), [], False
+    learner, rows, takeover = jax.jit(fns.init)(jax.random.key(seed), hparams), [], False
     for t in range(steps):
         if t % 5 == 0:
             ahead = predict_path(learner, jnp.zeros(1), False)
@@ -65,13 +65,14 @@ def equal(one, other):
 @pytest.mark.parametrize("algorithm", ["ppl", "pvp", "hg_dagger", "iwr", "eil", "haco"])
 def test_a_session_teaches_and_its_recording_teaches_the_same(algorithm):
     probe, fns = live(algorithm)
-    learner, rows = session(probe, fns, 200)
+    hparams = small(algorithm)[1]
+    learner, rows = session(probe, fns, 200, hparams=hparams)
     counters = learner.counters
     assert int(counters.steps) == 200
     assert 0 < int(counters.human_data) < 200
     assert int(counters.human_data) == int(rows.takeover.sum())
     assert int(counters.takeovers) == int(rows.takeover_start.sum())
-    again, _ = jax.jit(fns.ingest)(jax.jit(fns.init)(jax.random.key(0), HP), rows)
+    again, _ = jax.jit(fns.ingest)(jax.jit(fns.init)(jax.random.key(0), hparams), rows)
     equal(again.counters, counters)
     # one program rounds otherwise than the other
     for a, b in zip(*map(jax.tree.leaves, (again.algorithm, learner.algorithm)), strict=True):

@@ -34,8 +34,8 @@ def nut_xml() -> str:
     return nut_scene(
         grasp_contact.BEADS,
         grasp_contact.FEET,
-        pads=2 * len(gripper.PAD_ROWS),
-        soft=soft,
+        2 * len(gripper.PAD_ROWS),
+        soft,
         friction=grasp_contact.FRICTION,
     )
 

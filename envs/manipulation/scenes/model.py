@@ -200,7 +200,7 @@ def _inertial(tool: Tool) -> str:
     )
 
 
-def _pair(name: str, first: str, second: str, friction: float, soft: str) -> str:
+def _pair(name: str, first: str, second: str, friction: float, *, soft: str) -> str:
     return (
         f'<pair name="{name}" geom1="{first}" geom2="{second}" condim="3" '
         f'friction="{friction} {friction} 0 0 0" {soft}/>'
@@ -249,7 +249,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
 <geom class="shown" type="box" pos="0 0 .004" size=".03 .03 .012" rgba="{_STEEL}"/>
 <geom class="shown" type="box" pos="0 0 .0225" size=".03 .06 .0075" rgba=".95 .75 .25 1"/>"""
     pairs = "".join(
-        _pair(f"press_{i}", "table", f"point_{i}", friction, soft) for i in range(len(points))
+        _pair(f"press_{i}", "table", f"point_{i}", friction, soft=soft) for i in range(len(points))
     )
     spots = "".join(
         f'<body name="marker_{i}" mocap="true"><geom class="shown" type="cylinder" '
@@ -259,7 +259,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
     return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
-def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, friction: float) -> str:
+def nut_scene(beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, *, friction: float) -> str:
     """MJCF of nut assembly.
 
     The inner fingers are fixed to the knuckles here; `twins.py` turns them, and moves the pads'
@@ -317,19 +317,19 @@ def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, fric
 <geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
   rgba=".6 .62 .65 1"/>"""
     pairs = "".join(
-        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction, soft)
+        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction, soft=soft)
         for side in ("left", "right")
         for i in range(pads)
     )
     pairs += "".join(
-        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction, soft)
+        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction, soft=soft)
         for side in ("left", "right")
         for i in (0, pads // 2)
     )
     pairs += "".join(
-        _pair(f"foot_{i}", "table", f"foot_{i}", friction, soft) for i in range(len(feet))
+        _pair(f"foot_{i}", "table", f"foot_{i}", friction, soft=soft) for i in range(len(feet))
     )
     pairs += "".join(
-        _pair(f"bead_{i}", f"bead_{i}", "peg", friction, soft) for i in range(len(beads))
+        _pair(f"bead_{i}", f"bead_{i}", "peg", friction, soft=soft) for i in range(len(beads))
     )
     return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)

@@ -147,15 +147,15 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
     def step(s: NutState, _: None) -> tuple[NutState, None]:
         command = jnp.clip(s.command + grip, -1.0, 1.0)
         motion = operational_space.free_motion(
-            list(s.joints), list(s.speeds), goal=goal, tool=GRIPPER, weight=weight
+            list(s.joints), list(s.speeds), goal, GRIPPER, weight=weight
         )
         ring = Ring(s.position - BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
         knuckles, inner = s.fingers[::3], s.fingers[1::3]
         result = hold(
             motion,
             ring,
-            fingers=knuckles,
-            finger_speeds=s.finger_speeds[::3],
+            knuckles,
+            s.finger_speeds[::3],
             inner=inner,
             control=gripper.command_to_control(command),
             start=s.acceleration,
@@ -192,12 +192,7 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
 
 
 def stages(
-    eef: jax.Array,
-    position: jax.Array,
-    handle: jax.Array,
-    *,
-    touching: jax.Array,
-    time: jax.Array,
+    eef: jax.Array, position: jax.Array, handle: jax.Array, touching: jax.Array, *, time: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Robosuite's staged reward (reach, grasp, lift, hover), [4], and whether the ring is on.
 
@@ -292,11 +287,7 @@ class NutAssembly(ArmTask):
         eef = jnp.stack(at.position) + BASE
         position, quaternion = lagged_ring(new)
         staged, on = stages(
-            eef,
-            position,
-            handle_of(position, quaternion),
-            touching=new.touching,
-            time=new.time,
+            eef, position, handle_of(position, quaternion), new.touching, time=new.time
         )
         near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
         success = on & (near < PRESENCE) & ~physics_diverged

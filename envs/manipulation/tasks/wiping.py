@@ -182,7 +182,7 @@ def advance(state: WipingState, action: jax.Array) -> Moved:
     def step(carry: Any, _: None) -> tuple[Any, None]:
         joints, speeds, acceleration, _ = carry
         motion = operational_space.free_motion(
-            list(joints), list(speeds), goal=goal, tool=WIPER, weight=weight
+            list(joints), list(speeds), goal, WIPER, weight=weight
         )
         touch = press(motion, table, acceleration)
         speeds = speeds + TIMESTEP * touch.acceleration
@@ -202,9 +202,9 @@ def advance(state: WipingState, action: jax.Array) -> Moved:
 def reward_of(
     newly: jax.Array,
     wiped: jax.Array,
-    *,
     markers: jax.Array,
     eef: jax.Array,
+    *,
     force: jax.Array,
     contact: jax.Array,
     count: jax.Array,
@@ -325,8 +325,8 @@ class TableWiping(ArmTask):
         reward = reward_of(
             jnp.sum(newly),
             wiped,
-            markers=state.markers,
-            eef=jnp.stack(at.position) + BASE,
+            state.markers,
+            jnp.stack(at.position) + BASE,
             force=jnp.linalg.norm(state.force),
             contact=contact,
             count=count,

@@ -79,7 +79,7 @@ class Hover(ArmTask):
     ) -> tuple[HoverState, Outcome]:
         """One control step of 0.05 s: the arm moves, nothing touches it."""
         joints, speeds, rotation = free_steps(
-            state.joints, state.speeds, action, held=state.goal_rotation, tool=PROBE
+            state.joints, state.speeds, action, state.goal_rotation, tool=PROBE
         )
         moved = dataclasses.replace(state, joints=joints, speeds=speeds, goal_rotation=rotation)
         away = jnp.linalg.norm(state.goal - self.grip_position(moved))

@@ -1,0 +1,147 @@
+"""Everything that defines a run of `ppl expert train`, as config.json holds it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from envs.registry import known, unknown
+from experiments.engine.run_folder import RunFolder
+from experiments.engine.runtime import UserError
+from experiments.engine.settings import MAX_SEED, SCHEMA
+from ppl_jax.cards import card
+from ppl_jax.ppo.config import PPOConfig, PPOHParams, catalogue, read, replace, validate
+
+ALGORITHM = "ppo_lagrangian"  # in config.json
+FIRST_SCENARIO = 10_000  # of those an expert trains on: neither the novice's nor held out
+EVALUATIONS = 40  # over a run, unless asked for otherwise
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExpertSettings:
+    """Everything that defines a run; config.json holds it.
+
+    Attributes:
+        env, seed: What is trained.
+        config, hparams: Static and traced settings.
+        scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
+        training_scenarios: Number of generated scenarios to train on; 0 for the environment's own.
+        evaluate_every: Batches between evaluations and checkpoints.
+    """
+
+    env: str
+    seed: int
+    config: PPOConfig
+    hparams: PPOHParams
+    scenarios: str | None = None
+    held_out_scenarios: str | None = None
+    training_scenarios: int = 0
+    evaluate_every: int = 1
+
+    def as_json(self) -> dict[str, Any]:
+        """For config.json."""
+        plain = {name: getattr(self, name) for name in PLAIN}
+        settings = flat(self.config, self.hparams)
+        return {"schema": SCHEMA, **plain, "algorithm": ALGORITHM, "settings": settings}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> ExpertSettings:
+        """The inverse of `as_json`, of older versions too; ignores what else config.json holds.
+
+        Raises:
+            UserError: If it is of a newer version, or holds what no version has.
+        """
+        schema = content.get("schema", 1)
+        if schema > SCHEMA:
+            raise UserError(
+                f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
+                "written by a newer ppl-jax"
+            )
+        try:
+            found = content["config"] | content["hparams"] if schema == 1 else content["settings"]
+            config, hparams = read(found)
+            plain = {name: content[name] for name in PLAIN if name in content}
+            return ExpertSettings(**plain, config=config, hparams=hparams)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"config.json cannot be read: {error}") from error
+
+
+PLAIN = tuple(
+    field.name
+    for field in dataclasses.fields(ExpertSettings)
+    if field.name not in ("config", "hparams")
+)
+"""The fields of `ExpertSettings` beside the settings of PPO-Lagrangian."""
+
+
+def read_settings(folder: RunFolder) -> ExpertSettings:
+    """The settings of the run in a folder.
+
+    Raises:
+        UserError: If it is no run folder of `ppl expert train`.
+    """
+    try:
+        content = folder.config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    if content.get("algorithm") != ALGORITHM:
+        raise UserError(
+            f"{str(folder.path)!r} is a run of {content.get('algorithm')}, not of "
+            "`ppl expert train`"
+        )
+    return ExpertSettings.from_json(content)
+
+
+def flat(config: PPOConfig, hparams: PPOHParams) -> dict[str, Any]:
+    """Every setting of PPO-Lagrangian by name, as JSON has it: traced ones are floats."""
+    found: dict[str, Any] = {}
+    for name, one in catalogue(config, hparams).items():
+        value = float(np.asarray(one.value)) if one.traced else one.value
+        found[name] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+def settings_for(env: str) -> tuple[PPOConfig, PPOHParams, int]:
+    """The settings of an environment's expert, and on how many scenarios: those of its card.
+
+    Raises:
+        UserError: If the card names a setting that does not exist.
+    """
+    changes = card(env).expert
+    try:
+        config, hparams = replace(
+            PPOConfig(), PPOHParams(), **{**changes.config, **changes.hparams}
+        )
+    except ValueError as error:
+        raise UserError(f"the card of {env}: {error}") from error
+    return config, hparams, changes.scenarios
+
+
+def default_interval(config: PPOConfig) -> int:
+    """Batches between evaluations: a fortieth of the run."""
+    return max(config.batches // EVALUATIONS, 1)
+
+
+def check(settings: ExpertSettings) -> None:
+    """Refuse what cannot work, before anything is built.
+
+    Raises:
+        UserError: One line naming field, value and what is allowed.
+    """
+    if not known(settings.env):
+        raise UserError(unknown(settings.env))
+    for name, least in (("seed", 0), ("training_scenarios", 0), ("evaluate_every", 1)):
+        value = getattr(settings, name)
+        if value < least:
+            raise UserError(f"{name} must be at least {least}, got {value}")
+    if settings.seed > MAX_SEED:
+        raise UserError(f"seed must be at most {MAX_SEED}, got {settings.seed}")
+    if settings.training_scenarios and settings.scenarios is not None:
+        raise UserError("training_scenarios is for generated scenarios: give it, or --scenarios")
+    try:
+        validate(settings.config, settings.hparams)
+    except ValueError as error:
+        raise UserError(str(error)) from error
