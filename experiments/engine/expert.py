@@ -108,9 +108,10 @@ def _restore(folder: RunFolder, learner: PPOLearner) -> tuple[int, PPOLearner]:
     content = folder.config()
     if "schema" in content:
         return restore_learner(folder, learner)
-    names = [(name, jax.Array) for name in content["hparams"]]  # in the order of the checkpoint
-    kind = flax.struct.dataclass(dataclasses.make_dataclass("HParamsThen", names))
-    zeros = kind(**{name: jax.numpy.zeros((), jax.numpy.float32) for name, _ in names})
+    names = list(content["hparams"])  # in the order of the checkpoint
+    then = type("HParamsThen", (), {"__annotations__": dict.fromkeys(names, jax.Array)})
+    zero = jax.numpy.zeros((), jax.numpy.float32)
+    zeros = flax.struct.dataclass(then)(**dict.fromkeys(names, zero))
     like = dataclasses.replace(learner, hparams=zeros)
     done, found = restore_learner(folder, like)
     return done, dataclasses.replace(found, hparams=learner.hparams)

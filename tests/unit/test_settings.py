@@ -10,7 +10,8 @@ import pytest
 import ppl_jax
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, flat, one_level, run_settings, with_values
-from experiments.options.settings import parse_seeds, settings_in
+from experiments.options.seeds import parse_seeds
+from experiments.options.settings import settings_in
 from ppl_jax import algorithms
 from ppl_jax.config import (
     PRESETS,

@@ -161,7 +161,6 @@ def _around_peg(beads: jax.Array) -> _Points:
 def hold(
     motion: Motion,
     ring: Ring,
-    *,
     fingers: jax.Array,
     finger_speeds: jax.Array,
     inner: jax.Array,
