@@ -49,9 +49,9 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     """Measure and print; see the README for what the figures mean.
 
     Args:
-        repeats: Of each figure; medians are reported.
-        parts: Of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds in
-            one program), "sweep".
+        repeats: Repeats of each figure; medians are reported.
+        parts: Some of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds
+            in one program), "sweep".
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
