@@ -1,4 +1,4 @@
-"""What every environment shares: stepping with an automatic reset that draws a NEW start."""
+"""The base of every environment: stepping with an automatic reset that draws a NEW start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an environment keeps the contract of `ppl_jax.types.Env`: told in one line, at once.
+"""Checks that an environment keeps the contract of `ppl_jax.types.Env`; a misfit is one line.
 
 Shapes are found by tracing (`jax.eval_shape`); nothing is compiled and no step is made.
 """
@@ -43,7 +43,7 @@ def check_env(env: Any, name: str) -> None:
 
 
 class _DoesNotFit(Exception):
-    """What does not fit."""
+    """The part that does not fit."""
 
 
 def _require(fits: bool, message: str) -> None:

@@ -28,7 +28,7 @@ def register(
     Args:
         name: As the user types it.
         maker: `maker(**options) -> Env`; a class will do.
-        card: What is known of the environment without building it.
+        card: Facts about the environment that need no building of it.
         checked: Its tests call `envs.check.check_env`, so the first `make` need not.
 
     Raises:
@@ -80,7 +80,7 @@ def make(name: str, **options: Any) -> Env:
 
 
 def unknown(name: str) -> str:
-    """What to say of a name that no environment has."""
+    """The message for a name that no environment has."""
     close = difflib.get_close_matches(name, _MAKERS, n=1)
     hint = f", did you mean {close[0]!r}?" if close else ":"
     return (

@@ -1,1 +1,1 @@
-"""What people run: the command line, studies, tables."""
+"""The programs that people run: the command line, studies, tables."""

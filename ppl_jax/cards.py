@@ -1,4 +1,4 @@
-"""What a program may know of an environment without building it.
+"""Facts about an environment that need no building of it.
 
 A card is plain data: rates, units, budgets, and what the presets change for this environment. It
 imports no JAX, so that a command line can read it before anything heavy starts.
@@ -43,7 +43,7 @@ class EnvCard:
         speed_unit, place_unit: Units of `Outcome.speed` and of the place on a predicted path.
         actions: Names of the action's components; () where they have none.
         view: How it is drawn: "road" from above, "arm" through MuJoCo; None where it cannot be.
-        camera: Of an arm's view: lookat (m), distance (m), azimuth and elevation (degrees).
+        camera: Camera of an arm's view: lookat (m), distance (m), azimuth and elevation (degrees).
         predictors: Names of its prediction steps.
         experts: Names of its experts.
         neural_expert: A neural expert is shipped.

@@ -77,7 +77,7 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
         kept = steps(folder)
         raise OSError(
             f"cannot write checkpoint {step} in {folder}: {reason}; "
-            + (f"checkpoint {kept[-1]} is whole, go on from it with --resume" if kept else "")
+            + (f"checkpoint {kept[-1]} is whole, continue from it with --resume" if kept else "")
         ) from error
     for old in steps(folder)[:-KEPT]:
         shutil.rmtree(folder / f"{_PREFIX}{old}", ignore_errors=True)

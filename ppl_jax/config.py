@@ -35,7 +35,7 @@ class NoHParams:
 
 @flax.struct.dataclass
 class HParams:
-    """What a study sweeps: leaves of one pytree, so any of them may carry a batch axis.
+    """Traced settings: leaves of one pytree, so any of them may carry a batch axis.
 
     Attributes:
         learning_rate, expert_noise, prediction_noise: See the fields' own text.
@@ -66,7 +66,7 @@ class HParams:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """What sets shapes and programs.
+    """Static settings: they set shapes and programs.
 
     Attributes:
         method: Static settings that the method owns.
@@ -363,7 +363,7 @@ def check_value(name: str, value: Any, about: About) -> None:
     """Check one setting against what its field allows.
 
     Args:
-        name: Of the setting.
+        name: Name of the setting.
         value: A name, a switch, or numbers.
         about: Range and choices.
 

@@ -15,13 +15,14 @@ KEY = "ppl_jax"
 
 @dataclasses.dataclass(frozen=True)
 class About:
-    """What a field says of itself.
+    """Metadata of a settings field.
 
     Attributes:
         help: One sentence, with the unit.
         low, high: Smallest and largest value that is allowed; None where there is no bound.
         choices: Allowed values of a name, or None.
-        group: Of the command line: "run", "method", "gate", "predictor", "expert" or "evaluation".
+        group: Group on the command line: "run", "method", "gate", "predictor", "expert" or
+            "evaluation".
         common: Shown by `--help`, not only by `--help-all`.
     """
 
@@ -51,7 +52,7 @@ def setting(
         low: Smallest value allowed.
         high: Largest value allowed.
         choices: The names that are allowed.
-        group: Of the command line.
+        group: Group on the command line.
         common: Whether `--help` shows it.
     """
     about = About(help, low, high, None if choices is None else tuple(choices), group, common)
@@ -59,5 +60,5 @@ def setting(
 
 
 def about(field: dataclasses.Field[Any]) -> About:
-    """What a field says of itself; a field without `setting` has its name for help."""
+    """Metadata of a field; one without `setting` has its name for help."""
     return field.metadata.get(KEY, About(field.name.replace("_", " ")))

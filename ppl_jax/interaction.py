@@ -70,7 +70,7 @@ class Learner:
 
 
 class Steps(NamedTuple):
-    """What `make_steps` returns; all pure.
+    """Functions that `make_steps` returns; all pure.
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
@@ -78,8 +78,8 @@ class Steps(NamedTuple):
             novice, not yet clipped.
         query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with
             its noise.
-        interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step of
-            whoever `learner.takeover` says, the expert's action being `action` where it is given.
+        interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step
+            of expert or novice (see `learner.takeover`); `action` is the expert's where given.
             `started`: an expert in control was not in the step before.
         ingest: `ingest(learner, interaction) -> Learner`: store a recorded step as if made now.
         learn: `learn(learner, update) -> (Learner, Metrics)`: one update; where a loss is not
@@ -253,7 +253,7 @@ def make_steps(
         learner = store(
             dataclasses.replace(learner, key=key), interaction, outcome.physics_diverged
         )
-        # a takeover ends with its episode; the next decision waits for the grid
+        # a takeover ends with its episode; the gate next runs at a multiple of K
         learner = dataclasses.replace(learner, env_state=restarted, takeover=takeover & ~done)
         return learner, interaction
 

@@ -43,7 +43,7 @@ def predict(
         key: For a random transition.
         state: Start.
         action: [A] held through the prediction, or only its first action where `act` is given.
-        params: Of the world.
+        params: Parameters of the environment.
         horizon: H, static.
         observe: Also return the observation of every predicted state.
         act: Policy asked again at every predicted state (the released code's gate).

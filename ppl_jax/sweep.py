@@ -24,7 +24,7 @@ from ppl_jax.types import Env, PyTree
 
 
 class RunHistory(NamedTuple):
-    """What a run leaves: one entry per evaluation, [P].
+    """Results of a run: one entry per evaluation, [P].
 
     Attributes:
         episodes: `Episodes` of every held-out scenario, [P, S].
@@ -44,7 +44,7 @@ RunFn = Callable[[jax.Array, HParams, PyTree], Any]
 def evaluation_steps(config: TrainConfig, every: int) -> list[int]:
     """Environment steps at which a run is evaluated.
 
-    After what it learns offline, then every so many steps, and at its end.
+    After offline learning, then every `every` steps, and at its end.
     """
     begun, end = config.demonstrations, config.total_steps
     steps = [begun] if config.offline_updates else []
@@ -67,7 +67,7 @@ def make_run(
 
     Args:
         env: The world; its held-out parameters are an argument of the run, not a constant.
-        functions: Of the method (`ppl_jax.training.make_train`).
+        functions: The method's functions (`ppl_jax.training.make_train`).
         config: Static settings.
         keep_policy: Return (RunHistory, the policy's layers at the end) instead.
         every: Steps between evaluations; a multiple of the decision interval and of the method's

@@ -31,7 +31,7 @@ Phase = Literal["demonstrate", "fit", "interact"]
 
 
 class TrainFunctions(NamedTuple):
-    """What `make_train` returns; all pure, jittable and vmappable.
+    """Functions that `make_train` returns; all pure, jittable and vmappable.
 
     Attributes:
         init: `init(key, hparams) -> Learner`.

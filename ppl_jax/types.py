@@ -66,7 +66,7 @@ class Trajectory:
 
     Attributes:
         observation: [H, O] predicted observations, or [0, O] where none were asked for.
-        reward, speed: Of each predicted step.
+        reward, speed: Reward and speed of each predicted step.
         unsafe, success, terminated: Booleans.
         valid: The step was made: the prediction had not ended before it.
         expert_actions: [H, A] the expert's action at each predicted state, where it was asked, else

@@ -83,7 +83,7 @@ class FromBrax(Environment):
                 [-1, 1].
             name: As in results.
             max_episode_steps: Time limit.
-            cost, success: Of brax's state after a step.
+            cost, success: Functions of brax's state after a step.
             training, held_out: Seeds of the starts to train and to evaluate on.
 
         Raises:

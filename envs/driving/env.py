@@ -79,7 +79,7 @@ class DrivingParams:
         scenarios: Pool with a leading [S] axis.
         starts: State at the start of each scenario, [S]; a start is looked up, not computed.
         start_observations: [S, 259].
-        progress_weight, speed_weight: Of the reward's terms (per m; per share of 80 km/h).
+        progress_weight, speed_weight: Weights of the reward's terms (per m; per share of 80 km/h).
         success_reward, off_road_penalty, crash_penalty: Replace the reward in that step.
         off_road_cost, crash_vehicle_cost, crash_object_cost: Per step.
     """
@@ -98,7 +98,7 @@ class DrivingParams:
 
 
 class Events(NamedTuple):
-    """What happened in a step, booleans."""
+    """Events of a step, booleans."""
 
     arrived: jax.Array
     off_road: jax.Array
@@ -107,7 +107,7 @@ class Events(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """What the ego touches.
+    """Contacts of the ego.
 
     Attributes:
         depth, out: [N + K] overlap with each traffic vehicle and box, m, and [N + K, 2] the
@@ -131,7 +131,7 @@ def contacts(
     present: jax.Array,
     box_pose: jax.Array,
 ) -> Contacts:
-    """What the ego touches at `pose` [3]."""
+    """Contacts of the ego at `pose` [3]."""
     objects = scenario.objects
     boxes = jnp.concatenate([jnp.where(present[:, None], traffic_pose, 1e6), box_pose])
     half = jnp.concatenate([scenario.traffic.half, objects.box_half])
@@ -214,7 +214,7 @@ def push(
     box_velocity: jax.Array,
     touch: Contacts,
 ) -> tuple[vehicle.Ego, traffic_model.Traffic, jax.Array, jax.Array]:
-    """What a contact does: ego and the vehicle it runs into go on at their common speed.
+    """The effect of contacts: ego and the vehicle it runs into continue at their common speed.
 
     As in the simulator, where a car that hits a standing one loses half its speed and pushes it
     along, while cones, triangles and barriers do not hold it up at all. Both vehicles are taken

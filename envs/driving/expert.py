@@ -35,7 +35,7 @@ _PREVIEW = 0.25  # s: the yaw rate follows the wheel that much later
 
 
 class Things(NamedTuple):
-    """What is on the route around the ego, [J], in road coordinates.
+    """Objects on the route around the ego, [J], in road coordinates.
 
     Attributes:
         ahead: Distance along the route from the ego's centre, m; inf off the route.
@@ -84,9 +84,9 @@ def scripted_expert(
 
     Args:
         key: Unused: the expert is deterministic.
-        state: Of the world.
+        state: State of the environment.
         observation: Unused: it sees the state.
-        params: Of the world.
+        params: Parameters of the environment.
     """
     del key, observation
     return drive(state, params, CRUISE_SPEED, tracks_wrecks=False)
@@ -97,7 +97,7 @@ def cautious_expert(
 ) -> jax.Array:
     """`scripted_expert`, slower and minding wrecks that were pushed away.
 
-    What a neural expert learns from first.
+    A neural expert first learns from it.
     """
     del key, observation
     return drive(state, params, CAUTIOUS_SPEED, tracks_wrecks=True)
@@ -109,7 +109,7 @@ def drive(
     """The experts' action, [2], at no more than `cruise_speed` m/s.
 
     Args:
-        state, params: Of the world.
+        state, params: State and parameters of the environment.
         cruise_speed: m/s.
         tracks_wrecks: Wrecks are where they were pushed to; else forgotten once they lie still.
     """

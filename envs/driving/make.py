@@ -30,7 +30,7 @@ def make_driving(
         scenarios: Folder of recorded scenarios to train on; generated ones where None.
         held_out_scenarios: Folder of recorded scenarios to evaluate on; those of `scenarios`
             where None and `scenarios` is given.
-        settings: Of generated maps.
+        settings: Settings of generated maps.
         training, held_out: Numbers of the generated scenarios.
 
     Raises:

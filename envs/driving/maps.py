@@ -49,14 +49,14 @@ _MODELS = (
 
 @dataclasses.dataclass(frozen=True)
 class MapSettings:
-    """What generated maps are like.
+    """Settings of generated maps.
 
     Attributes:
         blocks: Number of blocks after the first.
         lanes: Lanes per direction.
         lane_width: m.
         traffic_density: Vehicles per 10 m of lane.
-        accident_probability: Of an accident scene on each block without junctions.
+        accident_probability: Probability of an accident scene on each block without junctions.
         kinds: Letters of the block kinds to draw from, with their usual relative probabilities.
     """
 

@@ -36,7 +36,7 @@ class Navigation:
 
 
 class Localised(NamedTuple):
-    """What one localisation found.
+    """Result of one localisation.
 
     Attributes:
         long, lateral: The ego's coordinates on every lane, [M], m.

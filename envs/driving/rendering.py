@@ -28,9 +28,9 @@ class Paths(NamedTuple):
     """Predicted positions to draw, [H, 2] each, or None.
 
     Attributes:
-        novice: Of the novice's held action.
+        novice: Path under the novice's held action.
         takeover: Whether the expert would take over.
-        expert: Of the expert driving.
+        expert: Path with the expert driving.
     """
 
     novice: np.ndarray | None = None
@@ -129,8 +129,8 @@ def draw(
     """A top-down picture centred on the ego, RGB [size, size, 3] uint8.
 
     Args:
-        scene: Of the state's scenario.
-        state: Of the world.
+        scene: The scene of the state's scenario.
+        state: State of the environment.
         paths: Predictions to draw.
         size: Pixels along an edge.
         span: Metres along an edge.

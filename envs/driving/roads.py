@@ -28,7 +28,7 @@ class Lane:
         length: Centre line length, m.
         width: m.
         turn: 0 straight, +1 anticlockwise, -1 clockwise.
-        center, radius, phase, angle: Of an arc: m, m, rad (position of the start seen from the
+        center, radius, phase, angle: An arc: m, m, rad (position of the start seen from the
             centre), rad (> 0).
         kerb: Whether a sidewalk runs along the right edge.
         taper: STRAIGHT, SHRINK or EXTEND: a constant width, or one that ends or begins at zero.

@@ -34,7 +34,7 @@ class Lanes:
         start, forward: Start point, m, and unit vector of travel there, [M, 2].
         length, width: m.
         turn: +1 anticlockwise arc, -1 clockwise, 0 straight.
-        center, radius, phase, angle: Of an arc, m and rad; [M, 2] and [M].
+        center, radius, phase, angle: An arc, m and rad; [M, 2] and [M].
         begin, reach: Longitudinal range that counts as on the lane, m. MetaDrive's lane surfaces
             run up to a metre over the ends.
         taper: 0 for a constant width, 1 shrinking to zero, 2 growing from zero.
@@ -130,7 +130,7 @@ class Scenario:
         final_lane, spawn_lane: Lane indices; the ego starts `SPAWN_LONG` m along the latter.
         engine_force, brake_force: Largest per wheel, N, and N s per 0.02 s.
         wheel_friction: Tyre friction coefficient.
-        objects, traffic: What else is there.
+        objects, traffic: Everything else in it.
     """
 
     number: Array
@@ -193,7 +193,7 @@ class Description:
         nodes: The route's nodes.
         spawn_number: Lane number of the ego on the first road.
         engine_force, brake_force, wheel_friction: As in `Scenario`.
-        objects, traffic: What else is there.
+        objects, traffic: Everything else in it.
     """
 
     number: int

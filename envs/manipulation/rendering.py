@@ -25,9 +25,9 @@ class ArmPaths(NamedTuple):
     """Predicted positions of the grip site to draw, [H, 3] each, or None.
 
     Attributes:
-        novice: Of the novice's held action.
+        novice: Path under the novice's held action.
         takeover: Whether the expert would take over.
-        expert: Of the expert at the controls.
+        expert: Path with the expert at the controls.
     """
 
     novice: np.ndarray | None = None

@@ -61,8 +61,8 @@ def announce_compile(name: str, key: str | None = None, quiet: bool = False) -> 
     """Announce on standard error what compiles, and remember how long it took.
 
     Args:
-        name: Of the program, for people: "training step".
-        key: What tells it from other programs of that name; the name itself if None.
+        name: Name of the program, for people: "training step".
+        key: Distinguishes it from other programs of that name; the name itself if None.
         quiet: Only remember: the caller shows the phrase.
 
     Yields:

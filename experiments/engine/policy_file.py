@@ -102,7 +102,7 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
 
 
 def load_meta(path: str | Path) -> dict[str, Any]:
-    """What a policy file says about itself.
+    """Facts that a policy file holds about itself.
 
     Raises:
         ValueError: If it cannot be read.

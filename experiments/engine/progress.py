@@ -49,7 +49,7 @@ class Progress:
 
         Args:
             what: The program, for people: "training step".
-            key: What tells it from other programs of that name; `what` if None.
+            key: Distinguishes it from other programs of that name; `what` if None.
         """
         began = time.perf_counter()
         with announce_compile(what, key, quiet=self.bar is not None) as phrase:

@@ -94,7 +94,7 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
     """Train, evaluating and saving on the way; returns the summary.
 
     Args:
-        settings: Of the run.
+        settings: Settings of the run.
         out: Run folder.
         resume: Go on from the folder's last checkpoint.
 
@@ -152,7 +152,7 @@ class _Chunk:
     """A piece of a run between two returns to the host.
 
     Attributes:
-        phase: Of the loop.
+        phase: Phase of the loop.
         length: Steps (updates in phase "fit").
         end: Steps and offline updates of the run by then: what progress and checkpoints count.
         step: Environment steps of the run by then.
@@ -193,12 +193,12 @@ def _part(length: int, interval: int) -> int:
 
 
 def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> None:
-    """Make a run folder, or check that the one to go on with was made with the same settings.
+    """Make a run folder, or check that the one to continue was made with the same settings.
 
     Args:
-        folder: Of the run.
-        content: Of config.json; versions, device and revision are added.
-        resume: Go on with the folder.
+        folder: Folder of the run.
+        content: Content of config.json; versions, device and revision are added.
+        resume: Continue the run in the folder.
 
     Raises:
         UserError: If it cannot be made, or differs.

@@ -39,7 +39,7 @@ class RunFolder:
         """
         if (self.path / CONFIG).exists():
             raise ValueError(
-                f"out folder {str(self.path)!r} already holds a run: give --resume to go on with "
+                f"out folder {str(self.path)!r} already holds a run: give --resume to continue "
                 "it, or another --out"
             )
         self.path.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What every command does before JAX starts, and how a user's mistake is told."""
+"""Work of every command before JAX starts, and the error that reports a user's mistake."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def revision() -> str:
 
 
 def device() -> dict[str, Any]:
-    """What JAX computes on."""
+    """The device that JAX computes on."""
     import jax
 
     devices = jax.devices()

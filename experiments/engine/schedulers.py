@@ -126,7 +126,7 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
 
     Args:
         jobs: In order.
-        address: Of a running cluster; None starts one on this machine.
+        address: Address of a running cluster; None starts one on this machine.
 
     Raises:
         UserError: If Ray is not installed or the cluster cannot be reached.

@@ -26,7 +26,7 @@ class Worker:
         self.programs: dict[str, Any] = {}
 
     def run(self, job: Job) -> Reply:
-        """What became of a job; a mistake or a failure is a reply too."""
+        """Result of a job; a mistake or a failure is a reply too."""
         from experiments.engine.runtime import UserError
 
         try:

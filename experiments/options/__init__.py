@@ -1,1 +1,1 @@
-"""What the commands take, generated from the settings classes."""
+"""Options of the commands, generated from the settings classes."""

@@ -1,4 +1,4 @@
-"""What the commands take beside the settings of a run."""
+"""Options of the commands beside the settings of a run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Compare:
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
     gate: str | None = None
-    """What makes the expert take over (default: the paper's rule for the world)."""
+    """Rule by which the expert takes over (default: the paper's rule for the world)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
@@ -251,7 +251,7 @@ class Table:
     step: int | None = None
     """Environment steps (default: the end of each run; all of a single run)."""
     format: Literal["text", "markdown", "latex"] = "text"
-    """How to write it."""
+    """Format of the table."""
     against: str | None = None
     """Row that the others are compared with, such as "ppl beta=0.1" (default: the default settings
     where they are there, else the first row)."""
@@ -276,7 +276,7 @@ class Figure:
     """Learning curves; success over one setting, or two; takeovers and cost in training; training
     of experts; steering on one map; what L buys and costs (default: what the results have)."""
     column: Literal["success", "progress", "episodic_return", "episodic_cost"] = "success"
-    """What is drawn."""
+    """Column to draw."""
     steps: tuple[int, ...] = ()
     """Kind axis: steps to draw (default: the end of each run)."""
     scenario: int = 1000
@@ -306,7 +306,7 @@ class Render:
     out: Path = Path("episode.gif")
     """File to write."""
     steps: int = 600
-    """At most so many steps."""
+    """Most steps to draw."""
     env: str = "driving"
     """World of "scripted" and "neural": driving, table_wiping or nut_assembly."""
 
@@ -328,7 +328,7 @@ class Play:
     beta: float | None = None
     """Temperature of the preference loss."""
     learning_rate: float | None = None
-    """Of Adam."""
+    """Adam's learning rate."""
     manual_episodes: int = 0
     """Number of episodes at the start in which you make every step."""
     participant: str = ""
@@ -396,7 +396,7 @@ class Bench:
         "experts",
         "methods",
     )
-    """What to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
+    """Parts to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
     against single ones) take long."""
     out: Path | None = None
     """Also write the figures to this JSON file."""

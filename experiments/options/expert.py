@@ -1,4 +1,4 @@
-"""What `ppl expert train` takes: the settings of one expert's run, with their true values."""
+"""Options of `ppl expert train`: the settings of one expert's run, with their true values."""
 
 from __future__ import annotations
 

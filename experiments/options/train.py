@@ -1,4 +1,4 @@
-"""What `ppl train` takes: the settings of one run, with the values it would really use."""
+"""Options of `ppl train`: the settings of one run, with the values it would really use."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class TrainRequest:
     """A parsed `ppl train`.
 
     Attributes:
-        settings: Of the run.
+        settings: Settings of the run.
         out: Run folder, or None for a new one.
         resume: Continue the run in it.
     """
@@ -165,7 +165,7 @@ class TrainRequest:
 
 
 def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) -> TrainRequest:
-    """What a parsed command line asks for.
+    """The request of a parsed command line.
 
     Raises:
         UserError: If a setting cannot work, or contradicts the run that is to be continued.

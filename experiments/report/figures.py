@@ -68,7 +68,7 @@ def figure(
             or (kind steering) a policy file.
         other: Kind steering: more policies; kind horizon: results over L, to show beside.
         kind: One of `KINDS` (default: what the results have).
-        column: What is drawn.
+        column: Column to draw.
         steps: Kind axis: steps to draw (default: the end of each run).
         scenario: Kind steering: number of a held-out scenario.
         out: Picture to write; its ending decides how.
@@ -343,7 +343,7 @@ def training(points: Sequence[Point], out: Path) -> None:
 
 
 def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> None:
-    """What a longer preference horizon L buys and costs, and the success that it led to.
+    """The benefit and cost of a longer preference horizon L, and the success that it led to.
 
     Args:
         measured: A file of `ppl horizon`.

@@ -31,9 +31,9 @@ def render(run: str, number: int, out: Path, steps: int, *, world: str = "drivin
 
     Args:
         run: Run folder, policy file, "scripted" or "neural".
-        number: Of the scenario.
+        number: Number of the scenario.
         out: .gif, .mp4 or .png (the last picture).
-        steps: At most so many.
+        steps: Most steps to draw.
         world: Where `run` is "scripted" or "neural".
 
     Raises:

@@ -1,4 +1,4 @@
-"""What the PPL paper reports (NeurIPS 2025), for showing beside our own figures.
+"""Figures that the PPL paper reports (NeurIPS 2025), for showing beside our own figures.
 
 From the paper's own simulators (MetaDrive, robosuite) and neural expert: to compare orders of
 methods with, not numbers. Standard deviations are over five training seeds where given.

@@ -48,7 +48,7 @@ class Point:
     Attributes:
         env, algorithm, step: World, method and environment steps.
         values: Settings that differ between runs of the same world and method.
-        seeds: Of the runs, sorted.
+        seeds: Seeds of the runs, sorted.
         measured: Column -> [seeds] values; columns that the file lacks are missing.
         episodes: Column -> [seeds, scenarios], where there is a row per scenario; else empty.
         scenarios: Their numbers, or none.
@@ -65,12 +65,12 @@ class Point:
 
     @property
     def label(self) -> str:
-        """Of a row."""
+        """Name of a row."""
         return " ".join([self.algorithm, *(f"{k}={v}" for k, v in self.values.items())])
 
     @property
     def over(self) -> str:
-        """What intervals are over: seeds and scenarios as far as the files have them."""
+        """Samples that intervals are over: seeds and scenarios, as far as the files have them."""
         several = len(self.seeds) > 1
         if self.scenarios:
             return BOTH if several else SCENARIOS
@@ -109,7 +109,7 @@ def difference(ours: Point, theirs: Point, column: str = "success") -> Interval 
 
 
 def common_over(points: Sequence[Point]) -> str | None:
-    """What intervals of one picture are all over; None where each point keeps its own."""
+    """Samples under all intervals of one picture; None where each point keeps its own."""
     kinds = {point.over for point in points}
     return SEEDS if kinds == {BOTH, SEEDS} else None
 
@@ -359,7 +359,7 @@ def reference_point(points: Sequence[Point], env: str, against: str | None = Non
     """The row that others are compared with.
 
     Args:
-        points: Of one world, at the steps that are compared.
+        points: Points of one environment, at the steps that are compared.
         env: Its name; "" where the file names none.
         against: Label of the row (default: the method's default settings where the grid holds
             them, else the first row).

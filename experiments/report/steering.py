@@ -27,7 +27,7 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
 
     Args:
         paths: Run folders or policy files of the driving world.
-        number: Of the scenario.
+        number: Number of the scenario.
         out: Picture to write.
 
     Raises:

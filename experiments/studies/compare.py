@@ -55,7 +55,7 @@ def settings_of(
 
     Args:
         command: Its options apply where the method has such settings.
-        algorithm, seed: Of the run.
+        algorithm, seed: Method and seed of the run.
         given: Settings of this run by name.
         own_length: The method keeps its own length and evaluations.
         **common: Further arguments of `run_settings`.

@@ -1,4 +1,4 @@
-"""What a sweep runs: axes, studies, and the groups of runs that share a compiled program."""
+"""Plans of sweeps: axes, studies, and the groups of runs that share a compiled program."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Study:
     """A named grid.
 
     Attributes:
-        title: What it asks, in words.
+        title: Its question, in words.
         algorithms: Methods, where none are asked for.
         axes: Values of each setting.
         total_steps: Factor on the world's own length, and the evaluations within it.
@@ -84,10 +84,10 @@ class Run:
     """One run of a sweep.
 
     Attributes:
-        name: Of its row: environment, label, values and seed.
-        values: Of every axis.
-        settings: Of the run.
-        label: What tables call it; the method where it is empty.
+        name: Name of its row: environment, label, values and seed.
+        values: Value of every axis.
+        settings: Settings of the run.
+        label: Its name in tables; the method where it is empty.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Group:
     """Runs that differ only in what is traced: one program.
 
     Attributes:
-        settings: Of its first run.
+        settings: Settings of its first run.
         runs: In order.
     """
 

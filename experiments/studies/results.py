@@ -37,7 +37,7 @@ class Results:
 
     Args:
         out: Folder of both.
-        runs: Of the sweep, in order.
+        runs: Runs of the sweep, in order.
     """
 
     def __init__(self, out: Path, runs: Sequence[Run]):

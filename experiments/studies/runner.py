@@ -131,7 +131,7 @@ def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
 def _settings(
     command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], *, seed: int
 ) -> RunSettings | None:
-    """Of one run; None where a study's L exceeds what the world predicts."""
+    """Settings of one run; None where a study's L exceeds the environment's H."""
     given = dict(chosen)
     if command.total_steps is not None:
         given["total_steps"] = command.total_steps
@@ -165,7 +165,7 @@ class Execution:
 
     Attributes:
         engine: "local" (processes of this machine) or "ray".
-        address: Of a running Ray cluster; one on this machine where None.
+        address: Address of a running Ray cluster; one on this machine where None.
         processes: Runs at the same time, on a CPU.
         batch: Runs per program; None lets the machine decide.
         dry_run: Say how much work it is, and stop.
@@ -245,7 +245,7 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
 
 
 def _program(run: Run) -> tuple[str, str]:
-    """What the program of a run is called, for people and in the log of compile times."""
+    """The name of a run's program, for people and in the log of compile times."""
     settings = run.settings
     name = f"{settings.algorithm} in {settings.env}"
     return name, f"sweep: {name}, {settings.config.total_steps} steps"

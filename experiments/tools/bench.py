@@ -49,9 +49,9 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     """Measure and print; see the README for what the figures mean.
 
     Args:
-        repeats: Of each figure; medians are reported.
-        parts: Of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds in
-            one program), "sweep".
+        repeats: Repeats of each figure; medians are reported.
+        parts: Some of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds
+            in one program), "sweep".
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
@@ -271,7 +271,7 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
 def _expert(name: str, repeats: int) -> dict[str, float]:
     """Environment steps per second of PPO-Lagrangian, updates included, and the updates' share.
 
-    Of the trainer alone: no guidance by a teacher, no batch cut short. The share is what a batch
+    It is the trainer alone: no guidance by a teacher, no batch cut short. The share is what a batch
     with all its epochs takes longer than one with a single epoch, per epoch and times their number.
     """
     from experiments.engine.expert_settings import settings_for

@@ -19,7 +19,7 @@ class Piece(NamedTuple):
     """Something that may be missing.
 
     Attributes:
-        name: Of the extra, or of the program.
+        name: Name of the extra, or of the program.
         what: It is for.
         modules: That it installs, by their import names.
         programs: One of which has to be on the path, if any are named.

@@ -53,8 +53,8 @@ class SessionConfig:
         """The settings in a config.json.
 
         Args:
-            content: Of config.json. One without "session" is of version 0.1, which wrote two of
-                them at the top; the others had their defaults or were not kept.
+            content: Content of config.json. One without "session" is of version 0.1, which wrote
+                two of them at the top; the others had their defaults or were not kept.
             rate: Where the file has none, steps per second.
         """
         if "session" not in content:

@@ -13,7 +13,7 @@ def named_options(command: Any, words: Sequence[str]) -> dict[str, Any]:
 
     Args:
         command: The parsed command: a record of its options.
-        words: Of the command line.
+        words: Words of the command line.
     """
     named = set(_named(words))
     return {

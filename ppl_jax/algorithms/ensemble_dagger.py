@@ -51,7 +51,7 @@ class Bootstrap:
     """Data of an ensemble whose members each have a data set of their own.
 
     Attributes:
-        buffer: Of (observation [O], expert action [A]).
+        buffer: Rows (observation [O], expert action [A]).
         copies: [C, K] how often row c is in member k's data set: Poisson(1), the limit of
             drawing as many rows with replacement (online bagging, Oza and Russell 2001).
     """

@@ -33,7 +33,7 @@ CLONING_BATCH = 1024
 
 
 class Round(NamedTuple):
-    """What is fixed while one round is shown: its number, the clone, the input statistics."""
+    """Fixed while one round is shown: its number, the clone, the input statistics."""
 
     problem: Problem
     number: jax.Array

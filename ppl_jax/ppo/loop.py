@@ -103,7 +103,7 @@ class Batch:
 
 
 class PPOFunctions(NamedTuple):
-    """What `make_ppo_lagrangian` returns; all pure, jittable and vmappable.
+    """Functions that `make_ppo_lagrangian` returns; all pure, jittable and vmappable.
 
     Attributes:
         init: `init(key, hparams) -> PPOLearner`.

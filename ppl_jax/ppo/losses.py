@@ -1,4 +1,4 @@
-"""What PPO-Lagrangian is made of: advantages, objective, divergence, statistics, multiplier."""
+"""Parts of PPO-Lagrangian: advantages, objective, divergence, statistics, multiplier."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def advantages(
         A_t     = delta_t + gamma lambda (1 - done_t) A_{t+1}
 
     Args:
-        reward, value: Of each step and of the state before it.
-        next_value: Of the state after it, before any reset.
+        reward, value: Reward of each step, and value of the state before it.
+        next_value: Value of the state after it, before any reset.
         terminated: The task ended there; done: or time was up.
         discount, gae_lambda: gamma and lambda.
     """
@@ -110,12 +110,12 @@ class RunningStats:
 
     @property
     def variance(self) -> jax.Array:
-        """Of the population; 0 before anything was seen."""
+        """Variance of the population; 0 before anything was seen."""
         return self.square / jnp.maximum(self.count, 1.0)
 
 
 def init_running_stats(shape: tuple[int, ...]) -> RunningStats:
-    """Statistics of nothing yet."""
+    """Empty running statistics."""
     return RunningStats(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
 
 
@@ -125,7 +125,7 @@ class Multiplier:
 
     Attributes:
         p: Scalar.
-        opt_state: Of Adam.
+        opt_state: State of Adam.
     """
 
     p: jax.Array

@@ -73,7 +73,7 @@ def make_problem(
 
 @flax.struct.dataclass
 class PPOLearned:
-    """What updates change.
+    """State that updates change.
 
     Attributes:
         policy: `Learned` of {"mean": network, "log_std": [A]}.

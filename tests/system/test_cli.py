@@ -254,7 +254,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(tmp_path):
         ]
         assert len(errors) == 1
         assert "no space left on device" in errors[0]
-        assert "go on from it with --resume" in errors[0]
+        assert "continue from it with --resume" in errors[0]
         assert checkpoint.steps(small / "run" / "checkpoints")
         subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
         ppl("train", "driving", *TINY, "--out", small / "run", "--resume")

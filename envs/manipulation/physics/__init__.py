@@ -1,1 +1,1 @@
-"""What advances an arm: one file or folder a back end."""
+"""Back ends that advance an arm, a file or folder each."""

@@ -78,7 +78,7 @@ class MujocoArm:
         self.site = self.model.site("grip").id
 
     def jacobian(self) -> np.ndarray:
-        """Of the grip site in the arm's joints, [6, 6]: m over rad."""
+        """Jacobian of the grip site in the arm's joints, [6, 6]: m over rad."""
         model, data = self.model, self.data
         jac = np.zeros((6, model.nv))
         self.mujoco.mj_jacSite(model, data, jac[:3], jac[3:], self.site)

@@ -1,1 +1,1 @@
-"""What stands in a scene: links, tools, table, nut and peg."""
+"""Parts of a scene: links, tools, table, nut and peg."""

@@ -40,12 +40,12 @@ class Link(NamedTuple):
     """A link of the arm, in its parent's frame; inertia in its own.
 
     Attributes:
-        name: Of body; its joint is `joint_0` ... `joint_5`.
-        position: Of the frame, m.
+        name: Name of the body; its joint is `joint_0` ... `joint_5`.
+        position: Origin of the frame, m.
         turned: The frame is turned by 90 degrees about y.
-        axis: Of the joint, "y" or "z".
+        axis: Axis of the joint, "y" or "z".
         mass: kg.
-        centre: Of mass, m.
+        centre: Centre of mass, m.
         inertia: Principal ones about x, y, z, kg m^2.
     """
 
@@ -78,7 +78,7 @@ DAMPING = 0.001  # N m s, every arm joint
 
 
 class Tool(NamedTuple):
-    """What the hand holds, rigid; along the hand's z axis.
+    """The rigid tool in the hand; along the hand's z axis.
 
     Attributes:
         mass: kg.
@@ -220,7 +220,7 @@ def arm_scene(
 
     Args:
         tool: In the hand: mass, inertia and grip site.
-        base: Of the arm in world axes, m.
+        base: Base of the arm in world axes, m.
         table: Centre and half size of its top, m, and the height, m.
         held: MJCF of the tool's shapes, in the hand's frame. Class "shown" is drawn only.
         bodies: MJCF of what else is there.
@@ -235,7 +235,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
     Args:
         points: [P, 2] contact points of the wiper's face, in the grip site's frame, m.
         soft: solref and solimp of a point, as MJCF attributes.
-        friction: Of the wiper on the table.
+        friction: Friction of the wiper on the table.
         markers: Number of spots of dirt (mocap bodies `marker_0` ...; drawn only).
     """
     radius = 0.001
@@ -269,7 +269,7 @@ def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, fric
         beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
         pads: Number of contact points on each pad.
         soft: solref and solimp, as MJCF attributes.
-        friction: Of all contacts.
+        friction: Friction of all contacts.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""

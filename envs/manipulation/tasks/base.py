@@ -1,4 +1,4 @@
-"""What the arm tasks share: a pool of starts, experts, and where the grip site is."""
+"""The base of the arm tasks: a pool of starts, experts, and where the grip site is."""
 
 from __future__ import annotations
 

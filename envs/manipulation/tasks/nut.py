@@ -281,7 +281,7 @@ class NutAssembly(ArmTask):
     def finish(
         self, state: NutState, moved: NutState, params: NutParams
     ) -> tuple[NutState, Outcome]:
-        """What a control step means, given its physics (see `advance`)."""
+        """The result of a control step, given its physics (see `advance`)."""
         values = [leaf for leaf in jax.tree.leaves(moved) if leaf.dtype == jnp.float32]
         physics_diverged = ~jnp.all(
             jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in values]))

@@ -117,7 +117,7 @@ def gap_below(at: Frames) -> jax.Array:
 
 
 def contact_count(at: Frames, table: jax.Array) -> jax.Array:
-    """How many contacts MuJoCo reports: lower corners of the wiper's boxes, and its spheres."""
+    """Number of contacts in MuJoCo: lower corners of the wiper's boxes, and its spheres."""
     x, y, _ = at.rotation
     height = at.position[2] - table
     corners = height + POINTS[:, 0] * x[2] + POINTS[:, 1] * y[2]
@@ -293,7 +293,7 @@ class TableWiping(ArmTask):
     def finish(
         self, state: WipingState, moved: Moved, params: WipingParams
     ) -> tuple[WipingState, Outcome]:
-        """What a control step means, given its physics (see `advance`)."""
+        """The result of a control step, given its physics (see `advance`)."""
         joints, speeds, acceleration, goal_rotation, push = moved
         physics_diverged = ~jnp.all(
             jnp.isfinite(jnp.concatenate([joints, speeds, acceleration, push]))

@@ -29,9 +29,9 @@ class Frames(NamedTuple):
     """Where everything is, in the frame of the arm's base.
 
     Attributes:
-        axes, anchors: Of the six joints: direction, and a point on the axis, m.
+        axes, anchors: For each of the six joints: direction, and a point on the axis, m.
         links: Position and rotation of each of the seven bodies (six links, the tool).
-        position, rotation: Of the grip site.
+        position, rotation: Pose of the grip site.
     """
 
     axes: list[Vector]
@@ -49,8 +49,8 @@ class Motion(NamedTuple):
         columns: Jacobian of the grip site, per joint (linear, angular).
         twist: Velocity of the grip site, m/s and rad/s.
         matrix: Mass matrix.
-        acceleration: Of the joints, without contact, rad/s^2.
-        speeds: Of the joints, rad/s.
+        acceleration: Acceleration of the joints, without contact, rad/s^2.
+        speeds: Speeds of the joints, rad/s.
     """
 
     at: Frames

@@ -54,7 +54,7 @@ def arm_hits(
 
     Args:
         at: Kinematics.
-        tool_ends: Of the tool's capsule, in the grip site's frame, m.
+        tool_ends: Ends of the tool's capsule, in the grip site's frame, m.
         table: Centre [2], half size [2] and height of its top, in the base's frame.
     """
     first, second, radius = [], [], []

@@ -108,7 +108,7 @@ def pad_points(
     """Points on both pads, [P, 3], and their velocity per knuckle speed, [P, 3].
 
     Args:
-        origin, axes: Of the hand.
+        origin, axes: Frame of the hand.
         fingers, inner: [2] knuckle and inner finger angles, left and right.
     """
     places, slopes = [], []

@@ -42,7 +42,7 @@ _DAMPING = 2.0 / (IMPEDANCE[1] * TIME_CONSTANT)
 
 
 class Touch(NamedTuple):
-    """What the table does to the wiper.
+    """The effect of the table on the wiper.
 
     Attributes:
         acceleration: [6] of the joints, rad/s^2, contact included.
@@ -57,7 +57,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
     """Contact of the wiper's face with a table.
 
     Args:
-        motion: Of the arm without contact.
+        motion: Motion of the arm without contact.
         table: Height of the table's top above the arm's base, m.
         start: Acceleration to start from, rad/s^2: the last step's.
     """
