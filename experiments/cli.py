@@ -78,7 +78,7 @@ def parse(argv: Sequence[str]) -> Any:
     """
     named = next((word for word in argv if not word.startswith("-")), None)
     classes: dict[str, Any] = {"train": Train, **_PLAIN}
-    finish = _seeds
+    finish = lambda parsed: parsed  # noqa: E731
     if named == "train":
         from experiments.options.train import train_options, train_request
 
@@ -102,16 +102,6 @@ def parse(argv: Sequence[str]) -> Any:
     if isinstance(parsed, Play):
         parsed.words = tuple(words)
     return finish(parsed)
-
-
-def _seeds(parsed: Any) -> Any:
-    """The same with its words for seeds as numbers."""
-    if not hasattr(parsed, "seeds"):
-        return parsed
-    from experiments.options.settings import parse_seeds
-
-    parsed.seeds = parse_seeds(parsed.seeds)
-    return parsed
 
 
 def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
@@ -138,7 +128,7 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
 
     def finish(parsed: Any) -> Any:
         parsed.axes = axis_values(settings, parsed.axes)
-        return _seeds(parsed)
+        return parsed
 
     return made, finish
 
@@ -323,7 +313,7 @@ def _render(command: Render) -> None:
     from experiments.report.film import render
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps, command.env)
+    render(command.run, command.scenario, command.out, command.steps, world=command.env)
     print(f"wrote {command.out}")
 
 

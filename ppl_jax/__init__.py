@@ -22,6 +22,8 @@ _NAMES = {
     "train": "experiments.studies.quick",
     "main": "experiments.cli",
     "load_policy": "experiments.engine.policy_file",
+    "read_points": "experiments.report.points",
+    "difference": "experiments.report.points",
     "EnvCard": "ppl_jax.cards",
     "card": "ppl_jax.cards",
     "EnvSpec": "ppl_jax.types",
@@ -31,6 +33,7 @@ _NAMES = {
     "validate": "ppl_jax.config",
     "setting": "ppl_jax.fields",
     "settings": "ppl_jax.algorithms.registry",
+    "Algorithm": "ppl_jax.algorithms.base",
     "method": "ppl_jax.algorithms.registry",
     "register_method": "ppl_jax.algorithms.registry",
     "registered_methods": "ppl_jax.algorithms.registry",
@@ -42,12 +45,14 @@ _NAMES = {
     "make_evaluate": "ppl_jax.evaluation",
     "predict": "ppl_jax.predictors",
     "preference_pairs": "ppl_jax.preference",
+    "pair_likelihoods": "ppl_jax.losses",
     "preference_loss": "ppl_jax.losses",
     "bc_loss": "ppl_jax.losses",
 }
 _RENAMED = {"register_method": "register", "registered_methods": "registered"}
 
 if TYPE_CHECKING:
+    from ppl_jax.algorithms.base import Algorithm
     from ppl_jax.algorithms.registry import method, settings
     from ppl_jax.algorithms.registry import register as register_method
     from ppl_jax.algorithms.registry import registered as registered_methods
@@ -57,7 +62,7 @@ if TYPE_CHECKING:
     from ppl_jax.fields import setting
     from ppl_jax.gates import register_gate
     from ppl_jax.live import make_live
-    from ppl_jax.losses import bc_loss, preference_loss
+    from ppl_jax.losses import bc_loss, pair_likelihoods, preference_loss
     from ppl_jax.predictors import predict, register_predictor
     from ppl_jax.preference import preference_pairs
     from ppl_jax.training import make_train
@@ -70,9 +75,12 @@ if TYPE_CHECKING:
     train: Any
     main: Any
     load_policy: Any
+    read_points: Any
+    difference: Any
     register_study: Any
 
 __all__ = [
+    "Algorithm",
     "EnvCard",
     "EnvSpec",
     "Environment",
@@ -82,6 +90,7 @@ __all__ = [
     "__version__",
     "bc_loss",
     "card",
+    "difference",
     "load_policy",
     "main",
     "make",
@@ -89,9 +98,11 @@ __all__ = [
     "make_live",
     "make_train",
     "method",
+    "pair_likelihoods",
     "predict",
     "preference_loss",
     "preference_pairs",
+    "read_points",
     "register",
     "register_gate",
     "register_method",

@@ -35,9 +35,9 @@ class SavedPolicy(NamedTuple):
     obs_scale: Any
     log_std: Any = None
 
-    def __call__(self, observation: jax.Array) -> jax.Array:
-        """The deterministic action, [..., O] -> [..., A]."""
-        return act(self, observation)
+    def __call__(self, observation: Any) -> jax.Array:
+        """The deterministic action, [..., O] -> [..., A]; see `act`."""
+        return act(self, jnp.asarray(observation))
 
 
 def act(policy: SavedPolicy, observation: jax.Array) -> jax.Array:

@@ -250,9 +250,9 @@ def watch(
             transition,
             key_ahead,
             state,
-            held,
-            params,
-            max(config.prediction_horizon, most),
+            action=held,
+            params=params,
+            horizon=max(config.prediction_horizon, most),
             observe=True,
             labelling_expert=expert,
         )

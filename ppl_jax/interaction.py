@@ -95,7 +95,7 @@ class Steps(NamedTuple):
 
 
 def make_steps(
-    env: Env, expert: Expert | None, algorithm: Algorithm, config: TrainConfig, params: PyTree
+    env: Env, expert: Expert | None, algorithm: Algorithm, config: TrainConfig, *, params: PyTree
 ) -> Steps:
     """Build them.
 
@@ -158,9 +158,9 @@ def make_steps(
                 transition,
                 key,
                 state,
-                action,
-                params,
-                algorithm.predicted_steps,
+                action=action,
+                params=params,
+                horizon=algorithm.predicted_steps,
                 observe=True,
                 labelling_expert=expert if algorithm.labels_predictions else None,
             )

@@ -75,7 +75,7 @@ def make_live(
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
     predicted_transition = predictor(config.predictor).make(env)
-    steps = make_steps(env, None, algorithm, config, params)
+    steps = make_steps(env, None, algorithm, config, params=params)
 
     def predict_path(learner: Learner, action: jax.Array, mine: jax.Array) -> Trajectory:
         key_propose, key_predict = jax.random.split(learner.key)
@@ -92,9 +92,9 @@ def make_live(
             transition,
             key_predict,
             learner.env_state,
-            jnp.where(mine, action, proposed),
-            params,
-            config.prediction_horizon,
+            action=jnp.where(mine, action, proposed),
+            params=params,
+            horizon=config.prediction_horizon,
             place=place,
         )
 

@@ -23,6 +23,7 @@ def predict(
     transition: Transition,
     key: jax.Array,
     state: Any,
+    *,
     action: jax.Array,
     params: Any,
     horizon: int,

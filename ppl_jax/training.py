@@ -64,6 +64,7 @@ def make_train(
     expert: Expert,
     make_algorithm: MakeAlgorithm,
     config: TrainConfig,
+    *,
     env_params: PyTree | None = None,
 ) -> TrainFunctions:
     """Build the functions that train one policy.
@@ -89,7 +90,7 @@ def make_train(
         algorithm.decide is None and gate(config.gate).needs_expert_rollout
     )
     init, sample_novice_action, query_expert, interact, _, learn = make_steps(
-        env, expert, algorithm, config, params
+        env, expert, algorithm, config, params=params
     )
     interval = config.decision_interval
     check_rounds(algorithm, config)
@@ -117,9 +118,9 @@ def make_train(
             transition,
             key_predict,
             learner.env_state,
-            action,
-            params,
-            config.prediction_horizon,
+            action=action,
+            params=params,
+            horizon=config.prediction_horizon,
             observe=compares,
         )
         asked_again = config.gate_rollout == "closed_loop" or compares

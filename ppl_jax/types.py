@@ -13,6 +13,9 @@ from ppl_jax.cards import EnvCard
 
 PyTree = Any
 
+Array = jax.Array | np.ndarray
+"""JAX's or NumPy's: for what is packed in NumPy and goes to the device later."""
+
 
 @flax.struct.dataclass
 class StepInfo:

@@ -91,7 +91,9 @@ def curve_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
         (entry[1], node(number, "C", 0, 0)),
         (node(number, "C", 0, 0), node(number, "C", 0, 1)),
     )
-    parts = bend(lanes[-1], p["length"], p["radius"], math.radians(p["angle"]), bool(p["dir"]))
+    parts = bend(
+        lanes[-1], p["length"], p["radius"], math.radians(p["angle"]), clockwise=bool(p["dir"])
+    )
     for road, lane in zip(roads, parts, strict=True):
         network.add_road(road, lane, len(lanes))
         network.add_oncoming(road)
@@ -185,7 +187,7 @@ def _extension(start: np.ndarray, length: float, width: float, taper: int) -> La
     return straight(start, start + np.array([length, 0.0]), width, taper=taper)
 
 
-def intersection_block(base: RoadNetwork, entry: Road, number: int, p: dict, kind="X") -> Block:
+def intersection_block(base: RoadNetwork, entry: Road, number: int, p: dict, *, kind="X") -> Block:
     """X: a crossing of four arms; sockets right, ahead, left."""
     network = RoadNetwork()
     lanes = base.roads[entry]

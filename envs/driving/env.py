@@ -126,6 +126,7 @@ class Contacts(NamedTuple):
 def contacts(
     scenario: Scenario,
     pose: jax.Array,
+    *,
     traffic_pose: jax.Array,
     present: jax.Array,
     box_pose: jax.Array,
@@ -160,6 +161,7 @@ def off_road(found: nav.Localised, scenario: Scenario, pose: jax.Array) -> jax.A
 def reward_and_cost(
     params: DrivingParams,
     scenario: Scenario,
+    *,
     events: Events,
     navigation: nav.Navigation,
     long: jax.Array,
@@ -206,6 +208,7 @@ def push(
     scenario: Scenario,
     ego: vehicle.Ego,
     traffic: traffic_model.Traffic,
+    *,
     traffic_pose: jax.Array,
     box_pose: jax.Array,
     box_velocity: jax.Array,
@@ -229,12 +232,13 @@ def push(
     out = touch.out[worst]
     closing = jnp.minimum(jnp.sum((ego.velocity - velocity[worst]) * out), 0.0)
     exchange = jnp.where(depth[worst] > 0, 0.5 * closing, 0.0) * out
-    ego = ego.replace(velocity=ego.velocity - exchange)
+    ego = dataclasses.replace(ego, velocity=ego.velocity - exchange)
     struck = (jnp.arange(depth.shape[0]) == worst) & (depth[worst] > 0)
     hit = struck[:, None].astype(jnp.float32)
     moved = velocity + hit * exchange
     shift = -hit * depth[worst] * out
-    traffic = traffic.replace(
+    traffic = dataclasses.replace(
+        traffic,
         speed=jnp.maximum(jnp.sum(moved[:n] * heading, -1), 0.0),
         long=traffic.long + jnp.sum(shift[:n] * heading, -1),
     )
@@ -263,7 +267,7 @@ def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
         right=found.right,
         lateral=found.lateral[navigation.lane],
         traffic=traffic,
-        box_pose=scenario.objects.box_pose,
+        box_pose=jnp.asarray(scenario.objects.box_pose),
         box_velocity=jnp.zeros_like(scenario.objects.box_pose[:, :2]),
         blocked=jnp.zeros(traffic.status.shape, bool),
         time=jnp.zeros((), jnp.int32),
@@ -274,7 +278,12 @@ class Driving(Environment):
     """MetaDrive-like driving as pure functions. Build one with `make_driving`."""
 
     name = "driving"
-    spec = EnvSpec(obs.SIZE, 2, obs.MEAN, obs.SCALE)
+    spec = EnvSpec(
+        observation_size=obs.SIZE,
+        action_size=2,
+        observation_mean=obs.MEAN,
+        observation_scale=obs.SCALE,
+    )
     max_episode_steps = HORIZON
 
     def __init__(
@@ -301,7 +310,7 @@ class Driving(Environment):
 
     def scenario_numbers(self, params: DrivingParams) -> jax.Array:
         """Numbers of the pool's scenarios, [S]."""
-        return params.scenarios.number
+        return jnp.asarray(params.scenarios.number)
 
     def scenario_count(self, params: DrivingParams) -> int:
         """Number of scenarios in the pool."""
@@ -310,11 +319,14 @@ class Driving(Environment):
     def reset_to(self, index: jax.Array, key: jax.Array, params: DrivingParams) -> DrivingState:
         """The start of scenario `index` of the pool: standing, 5 m along its lane."""
         del key  # a scenario is deterministic
+        assert params.starts is not None
         return tree_index(params.starts, index)
 
     def reset(self, key: jax.Array, params: DrivingParams) -> tuple[jax.Array, DrivingState]:
         """A random scenario's start."""
         index = jax.random.randint(key, (), 0, self.scenario_count(params))
+        assert params.starts is not None
+        assert params.start_observations is not None
         return params.start_observations[index], tree_index(params.starts, index)
 
     def transition(
@@ -327,16 +339,21 @@ class Driving(Environment):
         ego_long, _ = lane_coordinates(lane, state.ego.pose[:2])
         speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
         traffic = traffic_model.advance(
-            scenario, state.traffic, state.navigation.lane, ego_long, speed, state.blocked
+            scenario,
+            state.traffic,
+            ego_lane=state.navigation.lane,
+            ego_long=ego_long,
+            ego_speed=speed,
+            blocked=state.blocked,
         )
         ego = vehicle.drive(
             state.ego,
             action,
-            scenario.engine_force,
-            scenario.brake_force,
-            scenario.wheel_friction,
+            engine_force=scenario.engine_force,
+            brake_force=scenario.brake_force,
+            friction=scenario.wheel_friction,
         )
-        return self._finish(params, scenario, state, ego, traffic, solid=True)
+        return self._finish(params, scenario, state, ego=ego, traffic=traffic, solid=True)
 
     def transition_kinematic(
         self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
@@ -347,26 +364,39 @@ class Driving(Environment):
         ego = vehicle.drive_kinematic(
             state.ego, action, scenario.engine_force, scenario.brake_force
         )
-        return self._finish(params, scenario, state, ego, state.traffic, solid=False)
+        return self._finish(params, scenario, state, ego=ego, traffic=state.traffic, solid=False)
 
     def _finish(
         self,
         params: DrivingParams,
         scenario: Scenario,
         state: DrivingState,
+        *,
         ego: vehicle.Ego,
         traffic: traffic_model.Traffic,
         solid: bool,
     ) -> tuple[DrivingState, Outcome]:
         present = traffic.status != traffic_model.REMOVED
         traffic_pose = traffic_model.poses(scenario, traffic)
-        touch = contacts(scenario, ego.pose, traffic_pose, present, state.box_pose)
+        touch = contacts(
+            scenario,
+            ego.pose,
+            traffic_pose=traffic_pose,
+            present=present,
+            box_pose=state.box_pose,
+        )
         local = to_body(ego.pose[:2] - traffic_pose[:, :2], traffic_pose[:, 2])
         has_ego_ahead = (local[:, 0] > 0) & (jnp.abs(local[:, 1]) < vehicle.HALF_SIZE[1])
         box_pose, box_velocity = state.box_pose, state.box_velocity
         if solid:
             ego, traffic, box_pose, box_velocity = push(
-                scenario, ego, traffic, traffic_pose, box_pose, box_velocity, touch
+                scenario,
+                ego,
+                traffic,
+                traffic_pose=traffic_pose,
+                box_pose=box_pose,
+                box_velocity=box_velocity,
+                touch=touch,
             )
         navigation, found = nav.localise(scenario, state.navigation, ego.pose)
         events = Events(
@@ -375,7 +405,14 @@ class Driving(Environment):
             crash_vehicle=touch.vehicle,
             crash_object=touch.object,
         )
-        reward, cost = reward_and_cost(params, scenario, events, navigation, found.long, ego)
+        reward, cost = reward_and_cost(
+            params,
+            scenario,
+            events=events,
+            navigation=navigation,
+            long=found.long,
+            ego=ego,
+        )
         time = state.time + 1
         new_state = DrivingState(
             scenario=state.scenario,
@@ -409,14 +446,19 @@ class Driving(Environment):
 def observe(scenario: Scenario, state: DrivingState) -> jax.Array:
     """The 259 values of a state in its scenario."""
     features = obs.ego_features(
-        scenario, state.ego, state.navigation, state.left, state.right, state.lateral
+        scenario,
+        state.ego,
+        state.navigation,
+        left=state.left,
+        right=state.right,
+        lateral=state.lateral,
     )
     rays = obs.lidar_reading(
         scenario,
         state.ego.pose,
-        traffic_model.poses(scenario, state.traffic),
-        state.traffic.status != traffic_model.REMOVED,
-        state.box_pose,
+        traffic_pose=traffic_model.poses(scenario, state.traffic),
+        present=state.traffic.status != traffic_model.REMOVED,
+        box_pose=state.box_pose,
     )
     return jnp.concatenate([features, rays])
 

@@ -17,6 +17,7 @@ from envs.driving.env import DrivingParams, DrivingState
 from envs.driving.geometry import lane_coordinates, lane_position, to_body
 from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import HALF_SIZE, MASS, MAX_STEERING, SUBSTEP, WHEELBASE
+from ppl_jax.types import Array
 
 CRUISE_SPEED = 12.0  # m/s
 CAUTIOUS_SPEED = 5.0  # m/s: what a single look at the road tells is then enough
@@ -60,7 +61,7 @@ def _along_route(scenario: Scenario, road: jax.Array, long: jax.Array) -> jax.Ar
 
 def _point_ahead(
     scenario: Scenario, road: jax.Array, long: jax.Array, lateral: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, Array]:
     """World point and signed curvature at `long` m along the route from the start of `road`.
 
     `long` may run past the end of the road on to the two after it.
@@ -123,7 +124,7 @@ def drive(
     ego_along = _along_route(scenario, road, long)
 
     things = _things(scenario, state, ego_along, tracks_wrecks)
-    target = _choose_lane(scenario, road, here, things, speed, width)
+    target = _choose_lane(scenario, road, here, things=things, speed=speed, width=width)
 
     # steering: pure pursuit of the target lane's centre line
     reach = jnp.clip(0.5 * speed + 2.0, 4.0, 9.0)
@@ -215,7 +216,7 @@ def _things(
         road = scenario.route_lane[jnp.maximum(route[vehicles : vehicles + boxes], 0)]
         place = lane_coordinates(tree_index(lanes, road), state.box_pose[:, :2])
         along, across = (
-            x.at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
+            jnp.asarray(x).at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
             for x, now in zip((along, across), place, strict=True)
         )
         strayed = jnp.zeros_like(strayed)
@@ -237,9 +238,10 @@ def _choose_lane(
     scenario: Scenario,
     road: jax.Array,
     here: jax.Array,
+    *,
     things: Things,
     speed: jax.Array,
-    width: jax.Array,
+    width: Array,
 ) -> jax.Array:
     """The lane to head for, the present one or a neighbour: the one with most free road."""
     number = jnp.arange(LANES)

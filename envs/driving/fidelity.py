@@ -17,6 +17,7 @@ Prints one JSON object for a folder of recordings (`md_<number>.npz`, and `neura
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -97,11 +98,12 @@ class Recording:
 
 
 def _navigation(lane: jax.Array, road: jax.Array) -> nav.Navigation:
-    return nav.Navigation(road, lane, jnp.zeros(()), jnp.zeros(()))
+    return nav.Navigation(road=road, lane=lane, travelled=jnp.zeros(()), last_long=jnp.zeros(()))
 
 
 def _ego(ego: jax.Array, before: jax.Array, action: jax.Array) -> vehicle.Ego:
-    return vehicle.place(ego[:3], ego[3:5], ego[5], action).replace(last_pose=before[:3])
+    placed = vehicle.place(ego[:3], ego[3:5], ego[5], action)
+    return dataclasses.replace(placed, last_pose=before[:3])
 
 
 def _edges(scenario: Scenario, lane: jax.Array, road: jax.Array, pose: jax.Array):
@@ -113,19 +115,25 @@ def _edges(scenario: Scenario, lane: jax.Array, road: jax.Array, pose: jax.Array
 
 @jax.jit
 @jax.vmap
-def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
+def _observe(scenario, ego, before, action, *, lane, road, traffic, boxes):
     def one(ego, before, action, lane, road, traffic, boxes):
         _, lateral, left, right = _edges(scenario, lane, road, ego[:3])
         features = obs.ego_features(
             scenario,
             _ego(ego, before, action),
             _navigation(lane, road),
-            left,
-            right,
-            lateral[lane],
+            left=left,
+            right=right,
+            lateral=lateral[lane],
         )
         traffic_pose = traffic[:, :3].at[:, :2].add(SEEN_AHEAD * traffic[:, 3:5])
-        rays = obs.lidar_reading(scenario, ego[:3], traffic_pose, traffic[:, 5] > 0, boxes)
+        rays = obs.lidar_reading(
+            scenario,
+            ego[:3],
+            traffic_pose=traffic_pose,
+            present=traffic[:, 5] > 0,
+            box_pose=boxes,
+        )
         return jnp.concatenate([features, rays])
 
     return jax.vmap(one)(ego, before, action, lane, road, traffic, boxes)
@@ -133,23 +141,31 @@ def _observe(scenario, ego, before, action, lane, road, traffic, boxes):
 
 @jax.jit
 @jax.vmap
-def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
+def _reward(scenario, ego, before, action, *, lane, road, traffic, boxes):
     params = driving.DrivingParams(scenarios=scenario)
 
     def one(ego, before, action, lane, road, traffic, boxes):
         long, lateral, left, right = _edges(scenario, lane, road, ego[:3])
         on_lane = jnp.any(on_lanes(scenario.lanes, long, lateral))
-        found = nav.Localised(long, lateral, on_lane, left, right)
+        found = nav.Localised(long=long, lateral=lateral, on_lane=on_lane, left=left, right=right)
         navigation = _navigation(lane, road)
         state = _ego(ego, before, action)
-        touch = driving.contacts(scenario, ego[:3], traffic[:, :3], traffic[:, 5] > 0, boxes)
-        events = driving.Events(
-            nav.arrived(scenario, navigation, found),
-            driving.off_road(found, scenario, ego[:3]),
-            touch.vehicle,
-            touch.object,
+        touch = driving.contacts(
+            scenario,
+            ego[:3],
+            traffic_pose=traffic[:, :3],
+            present=traffic[:, 5] > 0,
+            box_pose=boxes,
         )
-        reward, _ = driving.reward_and_cost(params, scenario, events, navigation, long, state)
+        events = driving.Events(
+            arrived=nav.arrived(scenario, navigation, found),
+            off_road=driving.off_road(found, scenario, ego[:3]),
+            crash_vehicle=touch.vehicle,
+            crash_object=touch.object,
+        )
+        reward, _ = driving.reward_and_cost(
+            params, scenario, events=events, navigation=navigation, long=long, ego=state
+        )
         return reward
 
     return jax.vmap(one)(ego, before, action, lane, road, traffic, boxes)
@@ -157,7 +173,7 @@ def _reward(scenario, ego, before, action, lane, road, traffic, boxes):
 
 @jax.jit
 @jax.vmap
-def _replay(scenario, ego, before, last_action, actions):
+def _replay(scenario, ego, before, last_action, *, actions):
     """Positions after each of `WINDOW` recorded actions from every recorded state."""
 
     def one(ego, before, last_action, actions):
@@ -165,9 +181,9 @@ def _replay(scenario, ego, before, last_action, actions):
             state = vehicle.drive(
                 state,
                 action,
-                scenario.engine_force,
-                scenario.brake_force,
-                scenario.wheel_friction,
+                engine_force=scenario.engine_force,
+                brake_force=scenario.brake_force,
+                friction=scenario.wheel_friction,
             )
             return state, state.pose
 
@@ -199,16 +215,20 @@ def compare(recordings: list[Recording]) -> dict[str, float]:
     )
     before = np.concatenate([ego[:, :1], ego[:, :-1]], 1)
     executed = np.concatenate([np.zeros_like(action[:, :1]), action], 1)
-    ours = np.asarray(_observe(scenario, ego, before, executed, lane, road, traffic, boxes))
+    ours = np.asarray(
+        _observe(
+            scenario, ego, before, executed, lane=lane, road=road, traffic=traffic, boxes=boxes
+        )
+    )
     rewards = _reward(
         scenario,
         ego[:, 1:],
         ego[:, :-1],
         action,
-        lane[:, 1:],
-        road[:, 1:],
-        traffic[:, 1:],
-        boxes[:, 1:],
+        lane=lane[:, 1:],
+        road=road[:, 1:],
+        traffic=traffic[:, 1:],
+        boxes=boxes[:, 1:],
     )
     windows = action.shape[1] - WINDOW + 1
     index = np.arange(windows)[:, None] + np.arange(WINDOW)
@@ -218,7 +238,7 @@ def compare(recordings: list[Recording]) -> dict[str, float]:
             ego[:, :windows],
             before[:, :windows],
             executed[:, :windows],
-            action[:, index],
+            actions=action[:, index],
         )
     )
     features, rays, reward_errors, position = [], [], [], []

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.driving.scenario import SIDEWALK, Lanes
+from ppl_jax.types import Array
 
 
-def wrap(angle: jax.Array) -> jax.Array:
+def wrap(angle: Array) -> Array:
     """Wrap to [-pi, pi)."""
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
@@ -19,7 +20,7 @@ _X = np.cos(np.pi * (np.arange(64) + 0.5) / 64) / 2 + 0.5
 _ATAN = np.polynomial.Polynomial.fit(_X, np.arctan(np.sqrt(_X)) / np.sqrt(_X), 9).convert().coef
 
 
-def arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
+def arctan2(y: Array, x: Array) -> jax.Array:
     """`jnp.arctan2` to 2e-7 rad; XLA's own runs one number at a time on a CPU (4 times slower)."""
     ax, ay = jnp.abs(x), jnp.abs(y)
     low, high = jnp.minimum(ax, ay), jnp.maximum(ax, ay)
@@ -34,19 +35,19 @@ def arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(y < 0, -angle, angle)
 
 
-def unit(heading: jax.Array) -> jax.Array:
+def unit(heading: Array) -> jax.Array:
     """Unit vector of a heading, [...] -> [..., 2]."""
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
 
 
-def to_body(vector: jax.Array, heading: jax.Array) -> jax.Array:
+def to_body(vector: Array, heading: Array) -> jax.Array:
     """World vectors in a body frame (x forward, y left), [..., 2]."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     x, y = vector[..., 0], vector[..., 1]
     return jnp.stack([c * x + s * y, -s * x + c * y], -1)
 
 
-def lane_coordinates(lanes: Lanes, position: jax.Array) -> tuple[jax.Array, jax.Array]:
+def lane_coordinates(lanes: Lanes, position: Array) -> tuple[jax.Array, jax.Array]:
     """(long, lateral) of a point on each lane; lateral is positive to the right.
 
     Args:
@@ -68,7 +69,7 @@ def lane_coordinates(lanes: Lanes, position: jax.Array) -> tuple[jax.Array, jax.
     )
 
 
-def lane_heading(lanes: Lanes, long: jax.Array) -> jax.Array:
+def lane_heading(lanes: Lanes, long: Array) -> jax.Array:
     """Heading of the centre line at `long`, rad."""
     straight = arctan2(lanes.forward[..., 1], lanes.forward[..., 0])
     return jnp.where(
@@ -76,7 +77,7 @@ def lane_heading(lanes: Lanes, long: jax.Array) -> jax.Array:
     )
 
 
-def runs_along(lanes: Lanes, pose: jax.Array) -> jax.Array:
+def runs_along(lanes: Lanes, pose: Array) -> jax.Array:
     """Which lanes run within 90 degrees of the heading at the pose [3], bool."""
     ahead = unit(pose[2])
     radial = pose[:2] - lanes.center
@@ -85,7 +86,7 @@ def runs_along(lanes: Lanes, pose: jax.Array) -> jax.Array:
     return jnp.sum(direction * ahead, -1) > 0
 
 
-def lane_position(lanes: Lanes, long: jax.Array, lateral: jax.Array) -> jax.Array:
+def lane_position(lanes: Lanes, long: Array, lateral: Array) -> jax.Array:
     """World position of (long, lateral), [..., 2]."""
     right = jnp.stack([lanes.forward[..., 1], -lanes.forward[..., 0]], -1)
     straight = lanes.start + long[..., None] * lanes.forward + lateral[..., None] * right
@@ -115,7 +116,7 @@ _OUTLINE = np.array(
 )
 
 
-def touches_sidewalk(lanes: Lanes, kerbs: jax.Array, pose: jax.Array, half: jax.Array) -> jax.Array:
+def touches_sidewalk(lanes: Lanes, kerbs: Array, pose: Array, half: Array) -> jax.Array:
     """Whether a rectangle touches a sidewalk, bool scalar.
 
     Its corners and the middles of its long sides are looked at: between them the side lies within
@@ -143,7 +144,7 @@ def touches_sidewalk(lanes: Lanes, kerbs: jax.Array, pose: jax.Array, half: jax.
 
 
 def box_contact(
-    pose: jax.Array, half: jax.Array, others: jax.Array, other_half: jax.Array
+    pose: Array, half: Array, others: Array, other_half: Array
 ) -> tuple[jax.Array, jax.Array]:
     """Overlap of a rectangle with others by separating axes.
 
@@ -174,7 +175,7 @@ def box_contact(
     return jnp.min(depths, -1), axis * sign
 
 
-def circle_depth(pose: jax.Array, half: jax.Array, circles: jax.Array) -> jax.Array:
+def circle_depth(pose: Array, half: Array, circles: Array) -> Array:
     """Overlap of a rectangle with circles, m, positive when they overlap, [C].
 
     Args:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ppl_jax.types import Array
+
 RAYS = 240
 RANGE = 50.0  # m
 
@@ -14,7 +16,7 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)]).astype(np.float32)  #
 _MISS = 1e9
 
 
-def box_distances(pose: jax.Array, boxes: jax.Array, half: jax.Array) -> jax.Array:
+def box_distances(pose: Array, boxes: Array, half: Array) -> jax.Array:
     """Distance along each ray to the nearest rectangle, m, [RAYS]; large where none is hit.
 
     Slab method in each rectangle's own frame: a ray enters at the last and leaves at the first
@@ -48,7 +50,7 @@ def box_distances(pose: jax.Array, boxes: jax.Array, half: jax.Array) -> jax.Arr
     return nearest
 
 
-def circle_distances(pose: jax.Array, circles: jax.Array) -> jax.Array:
+def circle_distances(pose: Array, circles: Array) -> jax.Array:
     """Distance along each ray to the nearest circle, m, [RAYS]; large where none is hit.
 
     Args:
@@ -71,7 +73,7 @@ def circle_distances(pose: jax.Array, circles: jax.Array) -> jax.Array:
     return nearest
 
 
-def scan(pose: jax.Array, boxes: jax.Array, half: jax.Array, circles: jax.Array) -> jax.Array:
+def scan(pose: Array, boxes: Array, half: Array, circles: Array) -> jax.Array:
     """The lidar reading: distance / 50 m, 1 where nothing is hit, [RAYS]."""
     nearest = jnp.minimum(box_distances(pose, boxes, half), circle_distances(pose, circles))
     return jnp.minimum(nearest / RANGE, 1.0)

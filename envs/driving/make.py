@@ -21,6 +21,7 @@ def make_driving(
     held_out_scenarios: str | Path | None = None,
     settings: MapSettings | None = None,
     training: Sequence[int] = TRAINING_SCENARIOS,
+    *,
     held_out: Sequence[int] = HELD_OUT_SCENARIOS,
 ) -> Driving:
     """Build the driving environment.

@@ -104,7 +104,7 @@ def generate(number: int, settings: MapSettings | None = None) -> Description:
         brake_force=float(rng.uniform(*BRAKE_FORCE)),
         wheel_friction=WHEEL_FRICTION,
         objects=tuple(objects),
-        traffic=tuple(_traffic(rng, blocks, network, closed, settings)),
+        traffic=tuple(_traffic(rng, blocks, network, closed, settings=settings)),
     )
 
 
@@ -185,11 +185,22 @@ def _accidents(
             if rng.random() > 0.5:
                 model = _draw_model(rng)
                 objects.append(
-                    _placed("vehicle", lane, (road, number), long, model.length, model.width)
+                    _placed(
+                        "vehicle",
+                        lane,
+                        (road, number),
+                        long,
+                        length=model.length,
+                        width=model.width,
+                    )
                 )
-                objects.append(_placed("warning", lane, (road, number), long - 10.0, 0.5, 0.5))
+                objects.append(
+                    _placed("warning", lane, (road, number), long - 10.0, length=0.5, width=0.5)
+                )
             else:
-                objects.append(_placed("barrier", lane, (road, number), long, 0.3, 2.0))
+                objects.append(
+                    _placed("barrier", lane, (road, number), long, length=0.3, width=2.0)
+                )
         closed.add((road, number))
     return objects, closed
 
@@ -199,6 +210,7 @@ def _placed(
     lane: Lane,
     name: tuple[Road, int],
     long: float,
+    *,
     length: float,
     width: float,
     lateral: float = 0.0,
@@ -220,9 +232,9 @@ def _cones(lane: Lane, name: tuple[Road, int], on_left: bool) -> list[ObjectSpec
             lane,
             name,
             middle + 2.0 * (first + i),
-            0.2,
-            0.2,
-            sign * (offset - lane.width / 2),
+            length=0.2,
+            width=0.2,
+            lateral=sign * (offset - lane.width / 2),
         )
         for i, offset in enumerate(offsets)
     ]
@@ -237,6 +249,7 @@ def _traffic(
     blocks: list[Block],
     network: RoadNetwork,
     closed: set[tuple[Road, int]],
+    *,
     settings: MapSettings,
 ) -> list[VehicleSpec]:
     """Vehicles of each block, on places 10 m apart, woken when the ego is on the road before it.

@@ -54,7 +54,12 @@ class Localised(NamedTuple):
 def start(scenario: Scenario) -> Navigation:
     """Before the first localisation."""
     zero = jnp.zeros((), jnp.float32)
-    return Navigation(jnp.zeros((), jnp.int32), scenario.spawn_lane, zero, zero)
+    return Navigation(
+        road=jnp.zeros((), jnp.int32),
+        lane=jnp.asarray(scenario.spawn_lane),
+        travelled=zero,
+        last_long=zero,
+    )
 
 
 def localise(
@@ -98,8 +103,8 @@ def localise(
     left = lateral[reference] + width / 2
     right = scenario.route_size[road] * width - left
     return (
-        Navigation(road, lane, travelled, long[reference]),
-        Localised(long, lateral, jnp.any(inside), left, right),
+        Navigation(road=road, lane=lane, travelled=travelled, last_long=long[reference]),
+        Localised(long=long, lateral=lateral, on_lane=jnp.any(inside), left=left, right=right),
     )
 
 

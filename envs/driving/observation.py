@@ -26,6 +26,7 @@ from envs.driving.geometry import lane_position, to_body, wrap
 from envs.driving.navigation import Navigation
 from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import CONTROL_STEP, Ego
+from ppl_jax.types import Array
 
 SIZE = 19 + lidar.RAYS
 # a network sees (observation - MEAN) / SCALE: a ray that hits nothing is 0, and the few numbers
@@ -38,7 +39,7 @@ _CHECKPOINT_RANGE = 50.0  # m
 _LARGEST_RADIUS, _LARGEST_ANGLE = 60.0, jnp.pi * 135.0 / 180.0
 
 
-def _checkpoint(scenario: Scenario, road: jax.Array, size: jax.Array, width: jax.Array, ego: Ego):
+def _checkpoint(scenario: Scenario, *, road: jax.Array, size: jax.Array, width: Array, ego: Ego):
     """Five values on the end of a route road, [5]."""
     lane = tree_index(scenario.lanes, scenario.route_lane[road])
     middle = (size / 2 - 0.5) * width
@@ -64,6 +65,7 @@ def ego_features(
     scenario: Scenario,
     ego: Ego,
     navigation: Navigation,
+    *,
     left: jax.Array,
     right: jax.Array,
     lateral: jax.Array,
@@ -106,13 +108,17 @@ def ego_features(
             (lateral * 2.0 / _WIDEST_LANE + 1.0) / 2.0,
         ]
     )
-    ends = [_checkpoint(scenario, road, size, width, ego) for road in (navigation.road, following)]
+    ends = [
+        _checkpoint(scenario, road=road, size=size, width=width, ego=ego)
+        for road in (navigation.road, following)
+    ]
     return jnp.clip(jnp.concatenate([state, *ends]), 0.0, 1.0)
 
 
 def lidar_reading(
     scenario: Scenario,
     pose: jax.Array,
+    *,
     traffic_pose: jax.Array,
     present: jax.Array,
     box_pose: jax.Array,

@@ -82,11 +82,11 @@ def _lane(entry: dict, taper: int) -> Lane:
             entry["radius"],
             entry["start_phase"],
             entry["angle"],
-            entry["direction"],
-            entry["width"],
-            kerb,
+            turn=entry["direction"],
+            width=entry["width"],
+            kerb=kerb,
         )
-    return straight(entry["start"], entry["end"], entry["width"], kerb, taper)
+    return straight(entry["start"], entry["end"], entry["width"], kerb, taper=taper)
 
 
 def _object(entry: dict) -> ObjectSpec:

@@ -88,7 +88,7 @@ class Scene:
             owners.extend([lane] * len(found))
             colors.extend([color] * len(found))
 
-        for i in np.flatnonzero(lanes.width > 0):
+        for i in np.flatnonzero(lanes.width > 0).tolist():
             left, right = _lane_outline(lanes, i)
             self.surfaces.append(np.concatenate([left, right[::-1]]))
             inner, last = lanes.number[i] > 0, lanes.number[i] == lanes.road_size[i] - 1
@@ -121,6 +121,7 @@ def draw(
     scene: Scene,
     state: DrivingState,
     paths: Paths | None = None,
+    *,
     size: int = 480,
     span: float = 80.0,
     caption: str = "",
@@ -138,8 +139,9 @@ def draw(
     from PIL import Image, ImageDraw
 
     scenario, state = scene.scenario, jax.tree.map(np.asarray, state)
+    ego = np.asarray(state.ego.pose)
     zoom = 2  # drawn twice as large, then halved: smooth edges
-    camera = Camera(state.ego.pose[:2], span, size * zoom)
+    camera = Camera(ego[:2], span, size * zoom)
     image = Image.new("RGB", (size * zoom, size * zoom), GRASS)
     pen = ImageDraw.Draw(image)
     for surface in scene.surfaces:
@@ -161,13 +163,13 @@ def draw(
         if status != traffic_model.REMOVED:
             color = PARKED if status == traffic_model.PARKED else TRAFFIC
             pen.polygon(camera(_rectangle(pose, half)), fill=color)
-    pen.polygon(camera(_rectangle(state.ego.pose, np.array(HALF_SIZE))), fill=EGO)
+    pen.polygon(camera(_rectangle(ego, np.array(HALF_SIZE))), fill=EGO)
     if paths is not None:
         if paths.expert is not None:
-            _path(pen, camera, state.ego.pose[:2], paths.expert, EXPERT, zoom)
+            _path(pen, camera, ego[:2], paths.expert, color=EXPERT, zoom=zoom)
         if paths.novice is not None:
             color = DANGER if paths.takeover else SAFE
-            _path(pen, camera, state.ego.pose[:2], paths.novice, color, zoom)
+            _path(pen, camera, ego[:2], paths.novice, color=color, zoom=zoom)
     if caption:
         pen.text((8 * zoom, 8 * zoom), caption, fill=(20, 20, 20), font_size=13 * zoom)
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
@@ -176,7 +178,15 @@ def draw(
 traffic_poses = jax.jit(traffic_model.poses)
 
 
-def _path(pen: Any, camera: Camera, start: np.ndarray, path: np.ndarray, color, zoom: int) -> None:
+def _path(
+    pen: Any,
+    camera: Camera,
+    start: np.ndarray,
+    path: np.ndarray,
+    *,
+    color: tuple[int, int, int],
+    zoom: int,
+) -> None:
     points = camera(np.concatenate([start[None], path]))
     pen.line(points, fill=color, width=3 * zoom)
     for x, y in points[1:]:

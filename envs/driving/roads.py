@@ -83,13 +83,13 @@ class Lane:
         return (long >= 0) & (long <= self.length) & (np.abs(lateral) <= self.width / 2)
 
 
-def straight(start, end, width: float, kerb: bool = False, taper: int = STRAIGHT) -> Lane:
+def straight(start, end, width: float, kerb: bool = False, *, taper: int = STRAIGHT) -> Lane:
     """A straight lane between two points."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     return Lane(start, end, float(np.hypot(*(end - start))), width, kerb=kerb, taper=taper)
 
 
-def arc(center, radius: float, phase: float, angle: float, turn: int, width: float, kerb=False):
+def arc(center, radius: float, phase: float, angle: float, *, turn: int, width: float, kerb=False):
     """A circular lane; `turn` is +1 anticlockwise, -1 clockwise."""
     center = np.asarray(center, float)
 
@@ -115,13 +115,13 @@ def extend(lane: Lane, length: float, kerb: bool = False) -> Lane:
     return straight(lane.end, lane.position(lane.length + length, 0.0), lane.width, kerb)
 
 
-def bend(lane: Lane, length: float, radius: float, angle: float, clockwise: bool, kerb=False):
+def bend(lane: Lane, length: float, radius: float, angle: float, *, clockwise: bool, kerb=False):
     """An arc that leaves the end of a straight lane, and the straight of `length` m after it."""
     sign = 1 if clockwise else -1
     right = lane.position(0.0, 1.0) - lane.position(0.0, 0.0)
     center = lane.position(lane.length, sign * radius)
     phase = np.arctan2(right[1], right[0]) + (np.pi if clockwise else 0.0)
-    curve = arc(center, radius, phase, angle, -sign, lane.width, kerb)
+    curve = arc(center, radius, phase, angle, turn=-sign, width=lane.width, kerb=kerb)
     heading = curve.heading_at(curve.length)
     forward = np.array([np.cos(heading), np.sin(heading)])
     return curve, straight(curve.end, curve.end + length * forward, lane.width, kerb)
@@ -138,9 +138,9 @@ def beside(lane: Lane, offset: float, kerb: bool) -> Lane:
         lane.radius + offset * lane.turn,
         lane.phase,
         lane.angle,
-        lane.turn,
-        lane.width,
-        kerb,
+        turn=lane.turn,
+        width=lane.width,
+        kerb=kerb,
     )
 
 
@@ -197,8 +197,8 @@ class RoadNetwork:
                 last.radius + offset * last.turn,
                 last.phase + last.turn * last.angle,
                 last.angle,
-                -last.turn,
-                last.width,
+                turn=-last.turn,
+                width=last.width,
             )
         self.add_road(reverse_road(road), lane, len(lanes), kerb=kerb)
 

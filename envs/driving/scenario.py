@@ -7,14 +7,16 @@ the same shapes and `reset` picks one by its index.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import flax.struct
 import jax
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from envs.driving.roads import DECORATION, EXTEND, SHRINK, Lane, Road, RoadNetwork
+from ppl_jax.types import Array
 
 SIDEWALK = (0.2, 2.2)  # m beyond the outer lane edge: where the sidewalk starts and ends
 SPAWN_LONG = 5.0  # m along its lane at which the ego starts
@@ -42,22 +44,22 @@ class Lanes:
         node: Position of the road's first node among the route's nodes, -1 off it.
     """
 
-    start: jax.Array
-    forward: jax.Array
-    length: jax.Array
-    width: jax.Array
-    turn: jax.Array
-    center: jax.Array
-    radius: jax.Array
-    phase: jax.Array
-    angle: jax.Array
-    begin: jax.Array
-    reach: jax.Array
-    taper: jax.Array
-    number: jax.Array
-    road_size: jax.Array
-    route: jax.Array
-    node: jax.Array
+    start: Array
+    forward: Array
+    length: Array
+    width: Array
+    turn: Array
+    center: Array
+    radius: Array
+    phase: Array
+    angle: Array
+    begin: Array
+    reach: Array
+    taper: Array
+    number: Array
+    road_size: Array
+    route: Array
+    node: Array
 
 
 @flax.struct.dataclass
@@ -74,14 +76,14 @@ class Objects:
         along, across: [K + C] position along and right of the leftmost lane of that road, m.
     """
 
-    box_pose: jax.Array
-    box_half: jax.Array
-    box_is_vehicle: jax.Array
-    circle: jax.Array
-    lane: jax.Array
-    long: jax.Array
-    along: jax.Array
-    across: jax.Array
+    box_pose: Array
+    box_half: Array
+    box_is_vehicle: Array
+    circle: Array
+    lane: Array
+    long: Array
+    along: Array
+    across: Array
 
 
 @flax.struct.dataclass
@@ -100,17 +102,17 @@ class TrafficPlan:
         thrust, braking: [N] acceleration at full throttle and deceleration at full brake, m/s^2.
     """
 
-    half: jax.Array
-    exists: jax.Array
-    trigger: jax.Array
-    lane: jax.Array
-    long: jax.Array
-    way_first: jax.Array
-    way_size: jax.Array
-    way_shift: jax.Array
-    patience: jax.Array
-    thrust: jax.Array
-    braking: jax.Array
+    half: Array
+    exists: Array
+    trigger: Array
+    lane: Array
+    long: Array
+    way_first: Array
+    way_size: Array
+    way_shift: Array
+    patience: Array
+    thrust: Array
+    braking: Array
 
 
 @flax.struct.dataclass
@@ -131,18 +133,18 @@ class Scenario:
         objects, traffic: What else is there.
     """
 
-    number: jax.Array
+    number: Array
     lanes: Lanes
-    kerbs: jax.Array
-    route_lane: jax.Array
-    route_size: jax.Array
-    route_roads: jax.Array
-    route_length: jax.Array
-    final_lane: jax.Array
-    spawn_lane: jax.Array
-    engine_force: jax.Array
-    brake_force: jax.Array
-    wheel_friction: jax.Array
+    kerbs: Array
+    route_lane: Array
+    route_size: Array
+    route_roads: Array
+    route_length: Array
+    final_lane: Array
+    spawn_lane: Array
+    engine_force: Array
+    brake_force: Array
+    wheel_friction: Array
     objects: Objects
     traffic: TrafficPlan
 
@@ -267,8 +269,8 @@ def pack(description: Description, capacity: Capacity) -> Scenario:
                 f"got {getattr(capacity, field.name)}"
             )
     return Scenario(
-        number=np.int32(d.number),
-        lanes=_pack_lanes(lanes, d.network, d.nodes, route, capacity.lanes),
+        number=np.asarray(d.number, np.int32),
+        lanes=_pack_lanes(lanes, d.network, nodes=d.nodes, route=route, size=capacity.lanes),
         kerbs=_padded(
             [i for i, (_, _, lane) in enumerate(lanes) if _has_kerb(lane)],
             capacity.kerbs,
@@ -277,13 +279,13 @@ def pack(description: Description, capacity: Capacity) -> Scenario:
         ),
         route_lane=_padded([index[r, 0] for r in route], capacity.roads, 0, np.int32),
         route_size=_padded([len(d.network.roads[r]) for r in route], capacity.roads, 1, np.int32),
-        route_roads=np.int32(len(route)),
-        route_length=np.float32(sum(d.network.roads[r][0].length for r in route)),
-        final_lane=np.int32(index[route[-1], len(d.network.roads[route[-1]]) - 1]),
-        spawn_lane=np.int32(index[route[0], d.spawn_number]),
-        engine_force=np.float32(d.engine_force),
-        brake_force=np.float32(d.brake_force),
-        wheel_friction=np.float32(d.wheel_friction),
+        route_roads=np.asarray(len(route), np.int32),
+        route_length=np.asarray(sum(d.network.roads[r][0].length for r in route), np.float32),
+        final_lane=np.asarray(index[route[-1], len(d.network.roads[route[-1]]) - 1], np.int32),
+        spawn_lane=np.asarray(index[route[0], d.spawn_number], np.int32),
+        engine_force=np.asarray(d.engine_force, np.float32),
+        brake_force=np.asarray(d.brake_force, np.float32),
+        wheel_friction=np.asarray(d.wheel_friction, np.float32),
         objects=_pack_objects(d, index, capacity),
         traffic=_pack_traffic(d, index, route, capacity),
     )
@@ -294,7 +296,7 @@ def stack(scenarios: Sequence[Scenario]) -> Scenario:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
 
 
-def tree_index(pool: T, index: jax.Array | int) -> T:
+def tree_index(pool: T, index: Array | int) -> T:
     """The entry at `index` of structs that are stacked along their leaves' first axis."""
     return jax.tree.map(lambda leaf: leaf[index], pool)
 
@@ -304,7 +306,9 @@ def _has_kerb(lane: Lane) -> bool:
     return lane.kerb and not (lane.turn and lane.width / 2 + SIDEWALK[1] > lane.radius)
 
 
-def _padded(values, size: int, fill, dtype=np.float32) -> np.ndarray:
+def _padded(
+    values: ArrayLike, size: int, fill: ArrayLike, dtype: DTypeLike = np.float32
+) -> np.ndarray:
     values = np.asarray(values, dtype)
     out = np.full((size, *values.shape[1:]), fill, dtype)
     out[: len(values)] = values
@@ -314,6 +318,7 @@ def _padded(values, size: int, fill, dtype=np.float32) -> np.ndarray:
 def _pack_lanes(
     lanes: list[tuple[Road, int, Lane]],
     network: RoadNetwork,
+    *,
     nodes: tuple[str, ...],
     route: list[Road],
     size: int,
@@ -321,13 +326,17 @@ def _pack_lanes(
     route_position = {road: i for i, road in enumerate(route)}
     node_position = {name: i for i, name in enumerate(nodes)}
 
-    def column(measure, fill, dtype=np.float32):
+    def column(
+        measure: Callable[[Road, int, Lane], Any],
+        fill: float,
+        dtype: DTypeLike = np.float32,
+    ) -> np.ndarray:
         return _padded([measure(*entry) for entry in lanes], size, fill, dtype)
 
-    def forward(road, number, lane):
+    def forward(road: Road, number: int, lane: Lane) -> ArrayLike:
         return np.cos(lane.heading_at(0.0)), np.sin(lane.heading_at(0.0))
 
-    def reach(road, number, lane):
+    def reach(road: Road, number: int, lane: Lane) -> float:
         # the surface is drawn from points 1 m apart, the last at or past the end; an arc's has
         # one metre more at either end
         last = len(np.arange(0.0, lane.length + 1.0, 1.0)) - 1.0
@@ -356,7 +365,7 @@ def _pack_lanes(
 
 
 def _pack_objects(d: Description, index: dict, capacity: Capacity) -> Objects:
-    def rows(objects, size):
+    def rows(objects: list[ObjectSpec], size: int) -> tuple[np.ndarray, np.ndarray]:
         lane = _padded(
             [index[o.lane] if o.lane is not None else -1 for o in objects], size, -1, np.int32
         )

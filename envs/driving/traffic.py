@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from envs.driving.geometry import lane_heading, lane_position
 from envs.driving.scenario import Scenario, tree_index
 from envs.driving.vehicle import CONTROL_STEP
+from ppl_jax.types import Array
 
 REMOVED, PARKED, DRIVING = 0, 1, 2
 TARGET_SPEED, CREEP_SPEED, NO_LIMIT = 30.0, 5.0, 100.0  # km/h
@@ -59,12 +60,12 @@ def start(scenario: Scenario) -> Traffic:
     return Traffic(
         status=jnp.where(plan.exists, PARKED, REMOVED).astype(jnp.int32),
         leg=jnp.zeros_like(plan.lane),
-        number=plan.lane - plan.way_first[:, 0],
-        long=plan.long,
+        number=jnp.asarray(plan.lane - plan.way_first[:, 0]),
+        long=jnp.asarray(plan.long),
         lateral=zero,
         slide=zero,
         speed=zero,
-        waited=plan.patience,
+        waited=jnp.asarray(plan.patience),
     )
 
 
@@ -72,7 +73,7 @@ def _lane_index(scenario: Scenario, traffic: Traffic) -> jax.Array:
     return _at(scenario.traffic.way_first, traffic.leg) + traffic.number
 
 
-def _at(table: jax.Array, leg: jax.Array) -> jax.Array:
+def _at(table: Array, leg: jax.Array) -> jax.Array:
     """table[i, leg[i]], [N, Q], [N] -> [N]."""
     return jnp.take_along_axis(table, leg[:, None], 1)[:, 0]
 
@@ -88,6 +89,7 @@ def poses(scenario: Scenario, traffic: Traffic) -> jax.Array:
 def advance(
     scenario: Scenario,
     traffic: Traffic,
+    *,
     ego_lane: jax.Array,
     ego_long: jax.Array,
     ego_speed: jax.Array,

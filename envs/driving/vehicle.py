@@ -18,9 +18,13 @@ fitted to recorded drives: position error after 1 s 0.024 m median, 0.14 m at th
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+
+from ppl_jax.types import Array
 
 CONTROL_STEP, SUBSTEP, SUBSTEPS = 0.1, 0.02, 5  # s
 MASS = 1100.0  # kg
@@ -63,17 +67,25 @@ def place(pose: jax.Array, velocity: jax.Array, yaw_rate: jax.Array, action: jax
     """An ego vehicle at a reported pose, [3], [2], scalar, [2]."""
     late = (SUBSTEPS - REPORT_AFTER) * SUBSTEP
     body = pose + late * jnp.append(velocity, yaw_rate)
-    return Ego(pose, body, velocity, yaw_rate, pose, action)
+    return Ego(
+        pose=pose,
+        body=body,
+        velocity=velocity,
+        yaw_rate=yaw_rate,
+        last_pose=pose,
+        action=action,
+    )
 
 
 def _wheel_impulses(
     forward: jax.Array,
     sideways: jax.Array,
+    *,
     engine: jax.Array,
     brake: jax.Array,
     felt_mass: float,
     load: jax.Array,
-    friction: jax.Array,
+    friction: Array | float,
 ) -> tuple[jax.Array, jax.Array]:
     """Impulse along and across one wheel over a substep, N s, from its contact velocity."""
     stop = forward * (MASS / 4)
@@ -88,9 +100,10 @@ def _wheel_impulses(
 def drive(
     ego: Ego,
     action: jax.Array,
-    engine_force: jax.Array,
-    brake_force: jax.Array,
-    friction: jax.Array,
+    *,
+    engine_force: Array | float,
+    brake_force: Array | float,
+    friction: Array | float,
 ) -> Ego:
     """One control step of 0.1 s.
 
@@ -119,20 +132,20 @@ def drive(
         front_along, front_across = _wheel_impulses(
             cd * u + sd * front_side,
             -sd * u + cd * front_side,
-            engine,
-            brake,
-            FELT_MASS[0],
-            MASS * (GRAVITY * REAR - acceleration * MASS_HEIGHT) / WHEELBASE / 2,
-            friction,
+            engine=engine,
+            brake=brake,
+            felt_mass=FELT_MASS[0],
+            load=MASS * (GRAVITY * REAR - acceleration * MASS_HEIGHT) / WHEELBASE / 2,
+            friction=friction,
         )
         rear_along, rear_across = _wheel_impulses(
             u,
             w - REAR * yaw_rate,
-            engine,
-            brake,
-            FELT_MASS[1],
-            MASS * (GRAVITY * FRONT + acceleration * MASS_HEIGHT) / WHEELBASE / 2,
-            friction,
+            engine=engine,
+            brake=brake,
+            felt_mass=FELT_MASS[1],
+            load=MASS * (GRAVITY * FRONT + acceleration * MASS_HEIGHT) / WHEELBASE / 2,
+            friction=friction,
         )
         front_left = front_along * sd + front_across * cd
         du = 2 * (front_along * cd - front_across * sd + rear_along) / MASS
@@ -143,11 +156,18 @@ def drive(
         body = body + SUBSTEP * jnp.append(velocity, yaw_rate)
         if substep == REPORT_AFTER - 1:
             reported = body
-    return Ego(reported, body, velocity, yaw_rate, ego.pose, action)
+    return Ego(
+        pose=reported,
+        body=body,
+        velocity=velocity,
+        yaw_rate=yaw_rate,
+        last_pose=ego.pose,
+        action=action,
+    )
 
 
 def drive_kinematic(
-    ego: Ego, action: jax.Array, engine_force: jax.Array, brake_force: jax.Array
+    ego: Ego, action: jax.Array, engine_force: Array | float, brake_force: Array | float
 ) -> Ego:
     """One step of the plain kinematic bicycle, the paper's rule-based predictor.
 
@@ -170,4 +190,5 @@ def drive_kinematic(
     heading = ego.pose[2] + yaw_rate * CONTROL_STEP
     velocity = speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
     pose = jnp.append(ego.pose[:2] + velocity * CONTROL_STEP, heading)
-    return place(pose, velocity, yaw_rate, action).replace(last_pose=ego.pose)
+    placed = place(pose, velocity, yaw_rate, action)
+    return dataclasses.replace(placed, last_pose=ego.pose)

@@ -19,6 +19,7 @@ Prints one JSON object for a folder of recordings (`wipe_*`, `nut_*`, `free_wipe
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -42,15 +43,15 @@ _NUT = make_nut_assembly(range(1), range(1))
 _KEY = jax.random.key(0)
 
 
-def wiping_state(record: Any, row: Any) -> wiping.WipingState:
+def wiping_state(record: Any, row: int | tuple[int, ...]) -> wiping.WipingState:
     """The recorded state `row` (an index, or a tuple of them) of an episode."""
-    time = row if isinstance(row, int) else row[-1]
-    before = row if time == 0 else (row - 1 if isinstance(row, int) else (*row[:-1], time - 1))
+    at = (row,) if isinstance(row, int) else row
+    before = (*at[:-1], max(at[-1] - 1, 0))
     markers = record["marker_pos"]
     if markers.ndim == 3:
-        markers = markers[row[0]]
+        markers = markers[at[0]]
     return _wiping_state(
-        {name: record[name][row] for name in ("qpos", "qvel", "goal_ori", "ee_force", "force_bias",
+        {name: record[name][at] for name in ("qpos", "qvel", "goal_ori", "ee_force", "force_bias",
                                               "wiped", "qacc_warmstart", "obs", "timestep")}
         | {"marker_pos": markers, "shown": record["wiped"][before]}
     )  # fmt: skip
@@ -58,7 +59,8 @@ def wiping_state(record: Any, row: Any) -> wiping.WipingState:
 
 def _wiping_state(values: dict[str, np.ndarray]) -> wiping.WipingState:
     start = _WIPING.reset_to(jnp.int32(0), _KEY, _WIPING.default_params)
-    return start.replace(
+    return dataclasses.replace(
+        start,
         joints=jnp.float32(values["qpos"]),
         speeds=jnp.float32(values["qvel"]),
         acceleration=jnp.float32(values["qacc_warmstart"]),
@@ -81,7 +83,8 @@ def nut_state(record: Any, row: Any, prefix: str = "") -> nut.NutState:
     quaternion = jnp.float32(qpos[22:26])
     turn = np.asarray(nut.rotation_matrix(quaternion))
     touching = record[prefix + "pads_touch"][row] if prefix + "pads_touch" in record else False
-    return start.replace(
+    return dataclasses.replace(
+        start,
         joints=jnp.float32(qpos[:6]),
         speeds=jnp.float32(qvel[:6]),
         goal_rotation=jnp.float32(values["goal_ori"].T),
@@ -175,7 +178,8 @@ def _steps(folder: Path) -> float | None:
             qpos, qvel = record[prefix + "qpos"][run, 0], record[prefix + "qvel"][run, 0]
             start = env.reset_to(jnp.int32(0), _KEY, env.default_params)
             turn = record[prefix + "site_mat"][run, 0].T
-            start = start.replace(
+            start = dataclasses.replace(
+                start,
                 joints=jnp.float32(qpos[:6]),
                 speeds=jnp.float32(qvel[:6]),
                 goal_rotation=jnp.float32(turn),

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.manipulation.physics.mujoco_c import import_mujoco
 from envs.manipulation.twins import DrawnScene, NutTwin, WipingTwin, make_twin
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
@@ -77,9 +78,7 @@ class ArmScene:
             smooth: Edges without steps; half of the time goes there where no GPU draws.
         """
         choose_backend()
-        import mujoco
-
-        self.mujoco = mujoco
+        self.mujoco = mujoco = import_mujoco()
         self.twin: WipingTwin | NutTwin | DrawnScene = make_twin(env)
         self.model, self.data = self.twin.arm.model, self.twin.arm.data
         if not smooth:

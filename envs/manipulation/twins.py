@@ -6,6 +6,7 @@ only `transition` is not a JAX function (one environment at a time, no `jit`, no
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -60,8 +61,14 @@ class WipingTwin(wiping.TableWiping):
             mujoco.mj_contactForce(model, data, index, force)
             frame = data.contact[index].frame.reshape(3, 3)
             push += force[:3] @ frame  # the wiper's point is the pair's second geom
-        moved = (data.qpos[:6], data.qvel[:6], data.qacc[:6], goal[1].T, push)
-        return self._finish(state, *map(_single, moved), params)
+        moved = wiping.Moved(
+            joints=_single(data.qpos[:6]),
+            speeds=_single(data.qvel[:6]),
+            acceleration=_single(data.qacc[:6]),
+            goal_rotation=_single(goal[1].T),
+            push=_single(push),
+        )
+        return self._finish(state, moved, params)
 
 
 class NutTwin(nut.NutAssembly):
@@ -126,14 +133,14 @@ class NutTwin(nut.NutAssembly):
         self.place(state)
         arm = self.arm
         model, data, mujoco = arm.model, arm.data, arm.mujoco
-        action, goal = begin(arm, action, state.goal_rotation)
+        clipped, goal = begin(arm, action, state.goal_rotation)
         fingers = np.asarray(state.fingers, float).copy()
         speeds = np.asarray(state.finger_speeds, float).copy()
         dofs, ring, at = self._knuckles, self._ring, self._ring_at
         command, touching = float(state.command), False
         damp = gripper.STIFFNESS * gripper.LAG
         for _ in range(SUBSTEPS):
-            command = float(np.clip(command + gripper.RAMP * np.sign(action[6]), -1, 1))
+            command = float(np.clip(command + gripper.RAMP * np.sign(clipped[6]), -1, 1))
             self._pose_fingers(fingers[1::3])
             mujoco.mj_step1(model, data)
             data.qfrc_applied[:6] = torque(arm, goal)
@@ -155,7 +162,8 @@ class NutTwin(nut.NutAssembly):
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, data.qpos[at + 3 : at + 7])
 
-        moved = state.replace(
+        moved = dataclasses.replace(
+            state,
             joints=_single(data.qpos[:6]),
             speeds=_single(data.qvel[:6]),
             goal_rotation=_single(goal[1].T),

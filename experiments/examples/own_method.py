@@ -5,7 +5,7 @@
 
 "focused" is HG-DAgger that listens to the expert most where it errs most: a sample weighs its
 squared error to the power `focus`, a setting of its own: `--focus 0.5`, and an axis of sweeps.
-Everything else (gate, phases, resume, evaluation, tables, vmap over seeds) comes with the loop.
+The gate decides who acts, as for every method without a rule (`decide`) of its own.
 """
 
 import dataclasses
@@ -14,38 +14,37 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from experiments.cli import main
+import ppl_jax
 from ppl_jax import buffers
-from ppl_jax.algorithms import Algorithm, register
-from ppl_jax.buffers import RingBuffer
-from ppl_jax.fields import setting
 from ppl_jax.learned import Learned, adam_step, init_learned
-from ppl_jax.losses import bc_loss
 from ppl_jax.networks import layers, make_policy
 
 
 @flax.struct.dataclass
 class State:
-    """All of the method's state, one pytree; what updates change is in `learned`."""
+    """All of the method's state, one pytree; updates change `learned` alone."""
 
     learned: Learned
-    human_buffer: RingBuffer
+    human_buffer: buffers.RingBuffer
 
 
 @flax.struct.dataclass
 class FocusedHParams:
     """The method's own traced settings."""
 
-    focus: jax.Array | float = setting(0.5, "Power of the error in a sample's weight.", low=0)
+    focus: jax.Array | float = ppl_jax.setting(
+        0.5, "Power of the error in a sample's weight.", low=0, common=True
+    )
 
 
 def make_focused(spec, config):
-    """`spec` tells the sizes of the world, `config` what sets shapes."""
+    """`spec` holds the sizes of the world, `config` the static settings."""
     policy = make_policy(spec, config.hidden)
 
     def init(key):
         sample = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-        return State(init_learned(policy.init(key)), buffers.init_buffer(sample, 20_000))
+        buffer = buffers.init_buffer(sample, config.human_capacity)
+        return State(learned=init_learned(policy.init(key)), human_buffer=buffer)
 
     def act(state, key, observation):  # what the novice does while training
         return policy.apply(state.learned.params, observation)
@@ -62,24 +61,20 @@ def make_focused(spec, config):
             mean = policy.apply(params, observation)
             error = jax.lax.stop_gradient(jnp.sum((mean - action) ** 2, -1))
             weight = (error + 1e-6) ** hparams.method.focus
-            return bc_loss(mean, action, weight=weight / jnp.mean(weight))
+            return ppl_jax.bc_loss(mean, action, weight=weight / jnp.mean(weight))
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params)
         shown = buffers.size(state.human_buffer) > 0
         learned = adam_step(state.learned, grads, hparams.learning_rate, do=shown)
         return dataclasses.replace(state, learned=learned), metrics
 
-    return Algorithm(
-        name="focused",
-        init=init,
-        act=act,
-        store=store,
-        update=update,
+    return ppl_jax.Algorithm(
+        name="focused", init=init, act=act, store=store, update=update,
         policy=lambda state: layers(state.learned.average),  # what is evaluated and exported
-    )
+    )  # fmt: skip
 
 
-register("focused", make_focused, hparams=FocusedHParams)
+ppl_jax.register_method("focused", make_focused, hparams=FocusedHParams)
 
 if __name__ == "__main__":
-    main()
+    ppl_jax.main()

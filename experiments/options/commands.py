@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, arg, subcommand
 
+from experiments.options.seeds import Seeds
+
 
 @dataclasses.dataclass
 class Evaluate:
@@ -29,7 +31,7 @@ class Compare:
     """World: driving, table_wiping or nut_assembly."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: all)."""
-    seeds: tuple[str, ...] = ("5",)
+    seeds: Seeds = tuple(range(5))
     """How many (5), which (3 7 11) or a range (10-19); each method the same."""
     total_steps: int | None = None
     """Environment steps of each run (bc and gail keep their own)."""
@@ -65,7 +67,7 @@ class Ablation:
 
     env: Positional[str]
     """World: driving, table_wiping or nut_assembly."""
-    seeds: tuple[str, ...] = ("5",)
+    seeds: Seeds = tuple(range(5))
     """How many (5), which (3 7 11) or a range (10-19); each row the same."""
     total_steps: int | None = None
     """Environment steps of each run."""
@@ -93,7 +95,7 @@ class Tune:
     """World: driving, table_wiping or nut_assembly."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: all)."""
-    seeds: tuple[str, ...] = ("2",)
+    seeds: Seeds = tuple(range(2))
     """How many (5), which (3 7 11) or a range (10-19)."""
     total_steps: int = 3000
     """Environment steps of each run (bc keeps its own)."""
@@ -158,7 +160,7 @@ class Sweep:
     Values given replace the study's."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: ppl, or the study's)."""
-    seeds: tuple[str, ...] = ("5",)
+    seeds: Seeds = tuple(range(5))
     """How many (5), which (3 7 11) or a range (10-19); the same everywhere."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
@@ -226,7 +228,7 @@ class Horizon:
 
     env: Positional[str]
     """World: driving, table_wiping or nut_assembly."""
-    seeds: tuple[str, ...] = ("3",)
+    seeds: Seeds = tuple(range(3))
     """How many (5), which (3 7 11) or a range (10-19); one run each."""
     total_steps: int | None = None
     """Environment steps of each run."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Union
 
 import tyro
@@ -205,35 +205,6 @@ def _widths(name: str, text: str) -> tuple[int, ...]:
         raise UserError(
             f"{name} must be widths such as 64,64 for each value of a sweep, got {text!r}"
         ) from error
-
-
-def parse_seeds(words: Iterable[str]) -> tuple[int, ...]:
-    """Seeds from `5` (0 to 4), `3 7 11` or `10-19`.
-
-    Raises:
-        UserError: If a word is neither, a seed is there twice, or there is none.
-    """
-    words = list(words)
-    seeds: list[int] = []
-    try:
-        if len(words) == 1 and "-" not in words[0][1:]:
-            count = int(words[0])
-            if count < 1:
-                raise UserError(f"seeds must be at least 1, got {count}")
-            return tuple(range(count))
-        for word in words:
-            first, dash, last = word.partition("-")
-            seeds += range(int(first), int(last) + 1) if dash else [int(word)]
-    except ValueError as error:
-        raise UserError(
-            f"seeds must be a number of them (5), a list (3 7 11) or a range (10-19), got "
-            f"{' '.join(words)!r}"
-        ) from error
-    if not seeds:
-        raise UserError(f"seeds must be at least one, got {' '.join(words)!r}")
-    if len(set(seeds)) != len(seeds):
-        raise UserError(f"seeds: every seed once, got {' '.join(words)}")
-    return tuple(seeds)
 
 
 def environments() -> str:

@@ -26,7 +26,7 @@ Draw = Callable[[Any, np.ndarray, bool, np.ndarray, str], np.ndarray]
 """`draw(state, novice's path, takeover, expert's path, caption) -> picture`."""
 
 
-def render(run: str, number: int, out: Path, steps: int, world: str = "driving") -> None:
+def render(run: str, number: int, out: Path, steps: int, *, world: str = "driving") -> None:
     """Play a held-out scenario and write the film.
 
     Args:
@@ -76,8 +76,10 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     @jax.jit
     def step(state: Any):
         action = act(key, state, env.observe(state, params), params)
-        novice = ahead(state, action, params, horizon)
-        expert = ahead(state, action, params, horizon, expert=env.experts["scripted"])
+        novice = ahead(state, action=action, params=params, horizon=horizon)
+        expert = ahead(
+            state, action=action, params=params, horizon=horizon, expert=env.experts["scripted"]
+        )
         after, outcome = env.transition(key, state, action, params)
         point = DecisionPoint(
             observation=env.observe(state, params),

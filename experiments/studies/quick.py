@@ -114,7 +114,9 @@ def train(
         ValueError: One line naming setting, value and what is allowed.
     """
     try:
-        return _train(env, method, seed, preset, expert, evaluate_every, given)
+        return _train(
+            env, method, seed, preset, expert=expert, evaluate_every=evaluate_every, given=given
+        )
     except UserError as error:
         raise ValueError(str(error)) from None
 
@@ -124,6 +126,7 @@ def _train(
     method: str,
     seed: Any,
     preset: str,
+    *,
     expert: str,
     evaluate_every: int | None,
     given: Mapping[str, Any],
@@ -155,7 +158,7 @@ def _train(
             check(run)
             settings.append(run)
     histories, layers, numbers = _run(widest, settings)
-    return _result(settings, {**swept, "seed": seeds}, histories, layers, numbers)
+    return _result(settings, {**swept, "seed": seeds}, histories, layers, numbers=numbers)
 
 
 def _several(value: Any) -> bool:
@@ -191,6 +194,7 @@ def _result(
     axes: Mapping[str, tuple[Any, ...]],
     history: Any,
     layers: Any,
+    *,
     numbers: Any,
 ) -> Result:
     import jax

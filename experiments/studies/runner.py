@@ -80,7 +80,7 @@ def plan(command: Sweep) -> list[Run]:
         for algorithm in _algorithms(command):
             for chosen in _points(command, env, algorithm):
                 for seed in command.seeds:
-                    settings = _settings(command, env, algorithm, chosen, seed)
+                    settings = _settings(command, env, algorithm, chosen, seed=seed)
                     if settings is not None:
                         name = run_name(env, algorithm, chosen, seed)
                         runs.append(Run(name, tuple(chosen.items()), settings))
@@ -129,7 +129,7 @@ def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
 
 
 def _settings(
-    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], seed: int
+    command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], *, seed: int
 ) -> RunSettings | None:
     """Of one run; None where a study's L exceeds what the world predicts."""
     given = dict(chosen)

@@ -125,7 +125,15 @@ def _lookahead(env: Any, repeats: int) -> dict[str, float]:
     def run(state: Any) -> jax.Array:
         def call(total: jax.Array, _: None) -> Any:
             action = jnp.stack([total * 1e-9, 0.5])
-            ahead = predict(env, env.transition, jax.random.key(0), state, action, params, horizon)
+            ahead = predict(
+                env,
+                env.transition,
+                jax.random.key(0),
+                state,
+                action=action,
+                params=params,
+                horizon=horizon,
+            )
             return total + jnp.sum(ahead.reward), None
 
         return jax.lax.scan(call, jnp.zeros(()), None, length=calls)[0]
@@ -167,7 +175,11 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
         seconds = _median_s(lambda c=compiled, g=given: c(g, actions[-1]), repeats)
         figures[f"{name}_steps_per_s_{worlds}"] = worlds * steps / seconds
     ahead = jax.jit(
-        lambda state: predict(env, env.transition, key, state, actions[-1], params, 10).reward
+        lambda state: (
+            predict(
+                env, env.transition, key, state, action=actions[-1], params=params, horizon=10
+            ).reward
+        )
     )
     figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
     try:

@@ -232,13 +232,20 @@ def ppo_batch(
     steps: OnPolicyStep,
     reward: jax.Array,
     discount: jax.Array | float,
+    *,
     networks: Networks,
 ) -> PPOBatch:
     """A whole rollout [T] with its advantages, from rewards [T]."""
     before = networks.value.apply(learned.value.params, steps.observation)[..., 0]
     after = networks.value.apply(learned.value.params, steps.next_observation)[..., 0]
     advantage = advantages(
-        reward, before, after, steps.terminated, steps.done, discount, GAE_LAMBDA
+        reward,
+        before,
+        after,
+        steps.terminated,
+        done=steps.done,
+        discount=discount,
+        gae_lambda=GAE_LAMBDA,
     )
     returns = advantage + before
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -308,7 +315,7 @@ def update(
     novice_logit = logit(disc.params, steps.observation, steps.action, networks)
     reward = imitation_reward(novice_logit, hparams.method.survival_correction)
     learned = dataclasses.replace(state.learned, discriminator=disc)
-    rollout = ppo_batch(learned, steps, reward, hparams.method.discount, networks)
+    rollout = ppo_batch(learned, steps, reward, hparams.method.discount, networks=networks)
     learned, loss_value = improve(
         learned,
         rollout,

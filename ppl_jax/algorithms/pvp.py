@@ -106,6 +106,7 @@ def smoothed_target(
     batch: ReplayStep,
     key: jax.Array,
     discount: jax.Array | float,
+    *,
     networks: Networks,
 ) -> jax.Array:
     """TD3's target (Fujimoto et al. 2018): the target policy's action with clipped noise, [B]."""
@@ -155,7 +156,9 @@ def update(
     batch, weight = buffers.sample_split(state.replay, key_batch, config.batch_size)
     has_data = buffers.size(state.replay.human) > 0
     actor, critics = state.learned.actor, state.learned.critic
-    target = smoothed_target(state.learned, batch, key_noise, hparams.method.discount, networks)
+    target = smoothed_target(
+        state.learned, batch, key_noise, hparams.method.discount, networks=networks
+    )
     loss = functools.partial(critic_loss, critic=networks.critic)
     grads, metrics = jax.grad(loss, has_aux=True)(critics.params, batch, target, weight)
     critics = adam_step(

@@ -158,7 +158,16 @@ def prepare(
     over = hparams.terminate_on_cost * steps.cost > 0
     ends = (steps.terminated | over)[..., None], (steps.done | over)[..., None]
     discount = jnp.stack([hparams.discount, hparams.cost_discount])
-    gain = advantages(signal, before, after, *ends, discount, hparams.gae_lambda)
+    terminated, done = ends
+    gain = advantages(
+        signal,
+        before,
+        after,
+        terminated,
+        done=done,
+        discount=discount,
+        gae_lambda=hparams.gae_lambda,
+    )
     inputs, action, expert_actions, gain, target = (
         jnp.reshape(x, (problem.config.batch_steps, -1))
         for x in (inputs, steps.action, steps.expert_actions, gain, gain + before)
@@ -334,7 +343,7 @@ def iterate(problem: Problem, learner: PPOLearner, _: None) -> tuple[PPOLearner,
     learned = dataclasses.replace(
         before,
         multiplier=update_multiplier(
-            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known
+            before.multiplier, cost, hparams.cost_limit, hparams.lagrangian_lr, known=known
         ),
     )
     learned, batch, metrics = prepare(problem, learned, steps, hparams)

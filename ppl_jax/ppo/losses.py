@@ -20,6 +20,7 @@ def advantages(
     value: jax.Array,
     next_value: jax.Array,
     terminated: jax.Array,
+    *,
     done: jax.Array,
     discount: jax.Array | float,
     gae_lambda: jax.Array | float,
@@ -150,6 +151,7 @@ def update_multiplier(
     cost: jax.Array,
     limit: jax.Array | float,
     rate: jax.Array | float,
+    *,
     known: jax.Array,
 ) -> Multiplier:
     """One step of Adam up the gradient J_C - d of p (J_C - d), where `known`.

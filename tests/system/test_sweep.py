@@ -19,7 +19,7 @@ from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, traced_values
 from experiments.engine.worker import Worker
 from experiments.options.commands import Sweep
-from experiments.studies import grid
+from experiments.studies import grid, quick
 from experiments.studies.runner import plan
 from ppl_jax import sweep as pure
 from ppl_jax.config import replace
@@ -360,3 +360,51 @@ def test_a_ray_cluster_that_loses_a_node_loses_and_doubles_nothing(tmp_path):
         cluster.shutdown()
     for name in FILES:
         assert (out / name).read_bytes() == (tmp_path / "local" / name).read_bytes()
+
+
+# --- another axis, and the call for notebooks ---
+
+
+def test_a_finished_sweep_takes_another_axis_without_running_the_old_cells_again(tmp_path):
+    sweep(tmp_path, "e", "--beta", "0.1", "0.3", "--seeds", "1")
+    before = {path.name: path.stat().st_mtime for path in (tmp_path / "e" / "policies").iterdir()}
+    old = {row["beta"]: row for row in rows_of(tmp_path / "e" / "results.csv")}
+    words = ["--beta", "0.1", "0.3", "--preference-horizon", "4", "2", "--seeds", "1"]
+    done = sweep(tmp_path, "e", *words)
+    assert "4 runs, 2 of them done" in done.stderr
+    after = {path.name: path.stat().st_mtime for path in (tmp_path / "e" / "policies").iterdir()}
+    assert {name: after[name] for name in before} == before
+    rows = rows_of(tmp_path / "e" / "results.csv")
+    assert len({row["run"] for row in rows}) == 4
+    for row in rows:
+        if row["preference_horizon"] == "4" and row["step"] == "60":
+            assert row["success"] == old[row["beta"]]["success"]
+    assert "results are in" in done.stdout
+    assert "ppl figure" in done.stdout
+
+
+def test_a_call_trains_what_a_run_trains_and_a_list_makes_a_grid(tmp_path):
+    small = {"total_steps": 60, "batch_size": 8, "hidden": (8,), "evaluate_every": 20}
+    one = quick.train("probe", "ppl", seed=3, **small)
+    settings = one.settings[0]
+    summary = train(settings, tmp_path / "run")
+    assert one.success == summary["success_rate"]
+    last = one.curve.iloc[-1]
+    assert last["human_data_usage"] == summary["human_data_usage"]
+    with np.load(tmp_path / "run" / "policy.npz") as file:
+        np.testing.assert_allclose(one.policy.weights[0][0], file["w0"], atol=1e-6)
+    grid = quick.train("probe", "ppl", seed=[3, 4], beta=np.array([0.1, 0.3]), **small)
+    assert grid.success.shape == (2, 2)
+    assert len(grid.policies) == 4
+    same = grid.curve[(grid.curve.beta == 0.1) & (grid.curve.seed == 3)]
+    assert list(same.human_data_usage) == list(one.curve.human_data_usage)
+    with pytest.raises(ValueError, match="there are 4 runs"):
+        grid.policy  # noqa: B018
+    for mistake, said in (
+        ({"beat": 1.0}, "unknown setting 'beat': did you mean 'beta'"),
+        ({"beta": [0.1, -1.0]}, "beta must not be negative, got -1"),
+        ({"batch_size": [8, 16]}, "batch_size sets the program and cannot be a list"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            quick.train("probe", "ppl", **(small | mistake))

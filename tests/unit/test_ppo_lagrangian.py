@@ -78,7 +78,9 @@ def test_advantages():
             delta = reward[i, world] + after - value[i, world]
             carried = 0.0 if done[i, world] else discount * gae_lambda * advantage
             expected[i, world] = advantage = delta + carried
-    found = advantages(reward, value, following, ended, done, discount, gae_lambda)
+    found = advantages(
+        reward, value, following, ended, done=done, discount=discount, gae_lambda=gae_lambda
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -115,7 +117,7 @@ def test_the_multiplier_is_adam_on_softplus():
     assert float(multiplier.value) == pytest.approx(1.5, rel=1e-5)
     for cost, there in zip(costs, known, strict=True):
         multiplier = parts.update_multiplier(
-            multiplier, jnp.float32(cost), limit, rate, jnp.asarray(there)
+            multiplier, jnp.float32(cost), limit, rate, known=jnp.asarray(there)
         )
         if there:
             count, slope = count + 1, -(cost - limit)

@@ -29,7 +29,16 @@ def test_a_prediction_is_the_transition_in_a_loop_and_leaves_no_trace(world, sta
     transition = lambda *args: rolled(*args, NoHParams())  # noqa: E731
     before = jax.tree.map(np.array, start)
     predicted = jax.jit(
-        lambda s: predict(world, transition, jax.random.key(1), s, action, params, H, observe=True)
+        lambda s: predict(
+            world,
+            transition,
+            jax.random.key(1),
+            s,
+            action=action,
+            params=params,
+            horizon=H,
+            observe=True,
+        )
     )(start)
     for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(start), strict=True):
         np.testing.assert_array_equal(old, new)
@@ -53,7 +62,14 @@ def test_the_real_step_is_the_same_with_and_without_a_prediction(world, start):
     @jax.jit
     def with_lookahead(state):
         ahead = predict(
-            world, world.transition, jax.random.key(0), state, -action, params, H, observe=True
+            world,
+            world.transition,
+            jax.random.key(0),
+            state,
+            action=-action,
+            params=params,
+            horizon=H,
+            observe=True,
         )
         return world.transition(None, state, action, params)[0], ahead.reward.sum()
 

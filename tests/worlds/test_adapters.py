@@ -138,7 +138,9 @@ def test_our_parts_against_braxs():
     never = np.zeros((steps, worlds), np.float32)
     # brax's advantages are one more step of TD on its targets, so it is the targets that compare
     targets, _ = compute_gae(never, 1.0 * terminated, reward, value, following[-1], 0.9, 0.95)
-    ours = advantages(reward, value, following, terminated, terminated, 0.95, 0.9)
+    ours = advantages(
+        reward, value, following, terminated, done=terminated, discount=0.95, gae_lambda=0.9
+    )
     np.testing.assert_allclose(ours + value, targets, rtol=1e-4, atol=1e-5)
 
     state = running_statistics.init_state(jnp.zeros(4))

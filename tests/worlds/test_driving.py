@@ -106,7 +106,11 @@ def test_lane_coordinates_invert_positions_on_every_lane():
 
 def test_speed_limit_engine_brake_and_drag():
     """Known answers of the simulator's car (784.16 N, 114.16 N s per wheel, 1100 kg)."""
-    drive = jax.jit(lambda ego, action: vehicle.drive(ego, action, 784.16, 114.16, 0.9))
+    drive = jax.jit(
+        lambda ego, action: vehicle.drive(
+            ego, action, engine_force=784.16, brake_force=114.16, friction=0.9
+        )
+    )
 
     def speeds(v0, pedal, steps):
         ego = vehicle.place(jnp.zeros(3), jnp.array([v0, 0.0]), jnp.zeros(()), jnp.zeros(2))
@@ -128,7 +132,9 @@ def test_first_positions_from_standstill_lag_the_speed():
     ego = vehicle.place(jnp.zeros(3), jnp.zeros(2), jnp.zeros(()), jnp.zeros(2))
     track = []
     for _ in range(3):
-        ego = vehicle.drive(ego, jnp.array([0.0, 1.0]), 784.16, 114.16, 0.9)
+        ego = vehicle.drive(
+            ego, jnp.array([0.0, 1.0]), engine_force=784.16, brake_force=114.16, friction=0.9
+        )
         track.append(float(ego.pose[0]))
     # figures of the real simulator: 0.007, 0.034 + 0.007, ...
     np.testing.assert_allclose(np.diff([0.0, *track]), [0.007, 0.034, 0.063], atol=1e-3)
@@ -138,7 +144,9 @@ def test_mirrored_steering_gives_a_mirrored_track():
     def end(steer):
         ego = vehicle.place(jnp.zeros(3), jnp.array([8.0, 0.0]), jnp.zeros(()), jnp.zeros(2))
         for _ in range(10):
-            ego = vehicle.drive(ego, jnp.array([steer, 0.3]), 784.16, 114.16, 0.9)
+            ego = vehicle.drive(
+                ego, jnp.array([steer, 0.3]), engine_force=784.16, brake_force=114.16, friction=0.9
+            )
         return np.asarray(ego.pose)
 
     left, right = end(0.3), end(-0.3)
@@ -332,7 +340,11 @@ def test_a_wreck_is_pushed_and_a_cone_is_not_in_the_way():
 def test_contacts_by_sampling_points(world):
     scenario = tree_index(world.default_params.scenarios, 0)
     rng = np.random.default_rng(0)
-    touch = jax.jit(lambda p, t, b: contacts(scenario, p, t, jnp.ones(len(t), bool), b))
+    touch = jax.jit(
+        lambda p, t, b: contacts(
+            scenario, p, traffic_pose=t, present=jnp.ones(len(t), bool), box_pose=b
+        )
+    )
     half = np.array(vehicle.HALF_SIZE)
     n = scenario.traffic.half.shape[0]
     for _ in range(40):

@@ -265,7 +265,11 @@ def test_batched_arms_do_not_recompute():
         def step(carry, _):
             q, v = carry
             motion = operational_space.free_motion(
-                list(q), list(v), ((0.3, 0.0, 0.2), goal), WIPER, [jnp.zeros(())] * 6
+                list(q),
+                list(v),
+                goal=((0.3, 0.0, 0.2), goal),
+                tool=WIPER,
+                weight=[jnp.zeros(())] * 6,
             )
             v = v + TIMESTEP * jnp.stack(motion.acceleration)
             return (q + TIMESTEP * v, v), None
@@ -344,18 +348,22 @@ def test_wiping_needs_pressure_and_the_face():
 
 def test_stages_of_the_nut():
     far, on_table = jnp.array([0.0, 0.0, 1.0]), jnp.array([-0.11, -0.15, 0.83])
-    staged, on = nut.stages(far, on_table, on_table, jnp.array(False), jnp.int32(60))
+    staged, on = nut.stages(far, on_table, on_table, touching=jnp.array(False), time=jnp.int32(60))
     assert not bool(on)
     assert float(staged[1]) == 0
-    staged, _ = nut.stages(on_table, on_table, on_table, jnp.array(True), jnp.int32(60))
+    staged, _ = nut.stages(
+        on_table, on_table, on_table, touching=jnp.array(True), time=jnp.int32(60)
+    )
     assert float(staged[0]) == pytest.approx(0.1)
     assert float(staged[1]) == pytest.approx(0.35)
     lifted = jnp.array([0.23, -0.10, 0.995])
-    staged, on = nut.stages(lifted, lifted, lifted, jnp.array(True), jnp.int32(60))
+    staged, on = nut.stages(lifted, lifted, lifted, touching=jnp.array(True), time=jnp.int32(60))
     assert float(staged[3]) == pytest.approx(0.7)
     assert not bool(on)
     assert bool(
-        nut.stages(lifted, lifted.at[2].set(0.86), lifted, jnp.array(True), jnp.int32(1))[1]
+        nut.stages(
+            lifted, lifted.at[2].set(0.86), lifted, touching=jnp.array(True), time=jnp.int32(1)
+        )[1]
     )
 
 

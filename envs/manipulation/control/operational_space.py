@@ -86,6 +86,7 @@ def any_nonzero(values: list[Scalar]) -> Scalar:
 def free_motion(
     joints: list[Scalar],
     speeds: list[Scalar],
+    *,
     goal: tuple[Vector, Matrix],
     tool: Tool,
     weight: list[Scalar],
@@ -148,7 +149,7 @@ def free_motion(
 
 
 def free_steps(
-    joints: jax.Array, speeds: jax.Array, action: jax.Array, held: jax.Array, tool: Tool
+    joints: jax.Array, speeds: jax.Array, action: jax.Array, *, held: jax.Array, tool: Tool
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One control step of 0.05 s of an arm that nothing touches: 25 steps of 2 ms.
 
@@ -169,7 +170,7 @@ def free_steps(
 
     def step(carry: tuple[jax.Array, jax.Array], _: None) -> Any:
         joints, speeds = carry
-        motion = free_motion(list(joints), list(speeds), goal, tool, weight)
+        motion = free_motion(list(joints), list(speeds), goal=goal, tool=tool, weight=weight)
         speeds = speeds + TIMESTEP * jnp.stack(motion.acceleration)
         return (joints + TIMESTEP * speeds, speeds), None
 

@@ -6,6 +6,9 @@ what the hand-written physics is held against, and what draws the arm.
 
 from __future__ import annotations
 
+import importlib
+from typing import Any
+
 import numpy as np
 
 from envs.manipulation.physics.analytic import grasp_contact, gripper, wipe_contact
@@ -31,10 +34,24 @@ def nut_xml() -> str:
     return nut_scene(
         grasp_contact.BEADS,
         grasp_contact.FEET,
-        2 * len(gripper.PAD_ROWS),
-        soft,
-        grasp_contact.FRICTION,
+        pads=2 * len(gripper.PAD_ROWS),
+        soft=soft,
+        friction=grasp_contact.FRICTION,
     )
+
+
+def import_mujoco() -> Any:
+    """The module `mujoco`, whose names type checkers do not know.
+
+    Raises:
+        ImportError: Without MuJoCo.
+    """
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError as error:
+        raise ImportError(
+            "the C MuJoCo twin needs mujoco: pip install ppl-jax[manipulation]"
+        ) from error
 
 
 class MujocoArm:
@@ -55,13 +72,7 @@ class MujocoArm:
         Raises:
             ImportError: Without MuJoCo.
         """
-        try:
-            import mujoco
-        except ImportError as error:
-            raise ImportError(
-                "the C MuJoCo twin needs mujoco: pip install ppl-jax[manipulation]"
-            ) from error
-        self.mujoco = mujoco
+        self.mujoco = mujoco = import_mujoco()
         self.model = mujoco.MjModel.from_xml_string(xml)
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site("grip").id

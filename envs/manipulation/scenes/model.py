@@ -259,7 +259,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
     return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
-def nut_scene(beads: np.ndarray, feet: np.ndarray, pads: int, soft: str, friction: float) -> str:
+def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, friction: float) -> str:
     """MJCF of nut assembly.
 
     The inner fingers are fixed to the knuckles here; `twins.py` turns them, and moves the pads'

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,7 @@ from envs.manipulation.scenes.model import (
     TIMESTEP,
 )
 from envs.manipulation.tasks.base import ArmTask, lagged_frames
-from ppl_jax.types import EnvSpec, Outcome
+from ppl_jax.types import Array, EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 51, 7
 HORIZON = 1000  # control steps of 0.05 s
@@ -134,7 +136,8 @@ def advance(state: NutState, action: jax.Array) -> NutState:
 def _advance(state: NutState, action: jax.Array) -> NutState:
     at = unrolled_linalg.materialize(frames(list(state.joints), GRIPPER))
     action = jnp.clip(action, -1.0, 1.0)
-    held = tuple(tuple(row) for row in state.goal_rotation)
+    first, second, third = state.goal_rotation
+    held = (tuple(first), tuple(second), tuple(third))
     goal = unrolled_linalg.materialize(
         operational_space.new_goal(list(action[:6]), at.position, at.rotation, held)
     )
@@ -144,18 +147,18 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
     def step(s: NutState, _: None) -> tuple[NutState, None]:
         command = jnp.clip(s.command + grip, -1.0, 1.0)
         motion = operational_space.free_motion(
-            list(s.joints), list(s.speeds), goal, GRIPPER, weight
+            list(s.joints), list(s.speeds), goal=goal, tool=GRIPPER, weight=weight
         )
         ring = Ring(s.position - BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
         knuckles, inner = s.fingers[::3], s.fingers[1::3]
         result = hold(
             motion,
             ring,
-            knuckles,
-            s.finger_speeds[::3],
-            inner,
-            gripper.command_to_control(command),
-            s.acceleration,
+            fingers=knuckles,
+            finger_speeds=s.finger_speeds[::3],
+            inner=inner,
+            control=gripper.command_to_control(command),
+            start=s.acceleration,
         )
         a = result.acceleration
         speeds = s.speeds + TIMESTEP * a[:6]
@@ -166,7 +169,8 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
         outer = s.fingers[2::3]
         outer_speeds = (knuckle_rest - outer) / gripper.FOLLOW
         velocity, spin = s.velocity + TIMESTEP * a[8:11], s.spin + TIMESTEP * a[11:]
-        return s.replace(
+        return dataclasses.replace(
+            s,
             joints=s.joints + TIMESTEP * speeds,
             speeds=speeds,
             acceleration=a,
@@ -183,12 +187,17 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
         ), None
 
     rows = unrolled_linalg.array(goal[1])
-    start = state.replace(goal_rotation=rows, time=state.time + 1)
+    start = dataclasses.replace(state, goal_rotation=rows, time=state.time + 1)
     return jax.lax.scan(step, start, None, length=SUBSTEPS)[0]
 
 
 def stages(
-    eef: jax.Array, position: jax.Array, handle: jax.Array, touching: jax.Array, time: jax.Array
+    eef: jax.Array,
+    position: jax.Array,
+    handle: jax.Array,
+    *,
+    touching: jax.Array,
+    time: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Robosuite's staged reward (reach, grasp, lift, hover), [4], and whether the ring is on.
 
@@ -229,7 +238,12 @@ class NutAssembly(ArmTask):
     """Nut assembly as pure functions. Build one with `make_nut_assembly`."""
 
     name = "nut_assembly"
-    spec = EnvSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
+    spec = EnvSpec(
+        observation_size=OBSERVATION_SIZE,
+        action_size=ACTION_SIZE,
+        observation_mean=MEAN,
+        observation_scale=SCALE,
+    )
     max_episode_steps = HORIZON
     tool = GRIPPER
     base = BASE
@@ -273,11 +287,17 @@ class NutAssembly(ArmTask):
             jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in values]))
         )
         new = jax.tree.map(lambda a, b: jnp.where(physics_diverged, b, a), moved, state)
-        new = new.replace(time=state.time + 1)
+        new = dataclasses.replace(new, time=state.time + 1)
         at = lagged_frames(new, GRIPPER)
         eef = jnp.stack(at.position) + BASE
         position, quaternion = lagged_ring(new)
-        staged, on = stages(eef, position, handle_of(position, quaternion), new.touching, new.time)
+        staged, on = stages(
+            eef,
+            position,
+            handle_of(position, quaternion),
+            touching=new.touching,
+            time=new.time,
+        )
         near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
         success = on & (near < PRESENCE) & ~physics_diverged
         fallen = position[2] < FALLEN
@@ -336,7 +356,7 @@ class NutAssembly(ArmTask):
 def make_params(numbers: range) -> NutParams:
     """Starts of the scenarios with these numbers."""
 
-    def start(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def start(number: jax.Array) -> tuple[Array, jax.Array]:
         key_joints, key_place = jax.random.split(jax.random.key(number))
         low = jnp.array([PLACE_X[0], PLACE_Y[0], 0.0])
         high = jnp.array([PLACE_X[1], PLACE_Y[1], 2 * jnp.pi])
@@ -345,4 +365,9 @@ def make_params(numbers: range) -> NutParams:
 
     number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
     joints, place = jax.jit(jax.vmap(start))(number)
-    return NutParams(joints.astype(jnp.float32), place, number, jnp.float32(1.0))
+    return NutParams(
+        joints=joints.astype(jnp.float32),
+        place=place,
+        number=number,
+        reward_scale=jnp.float32(1.0),
+    )

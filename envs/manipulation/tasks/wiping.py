@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -33,7 +34,7 @@ from envs.manipulation.scenes.model import (
 )
 from envs.manipulation.tasks.base import ArmTask, lagged_frames
 from envs.manipulation.tasks.markers import COUNT, draw_markers
-from ppl_jax.types import EnvSpec, Outcome
+from ppl_jax.types import Array, EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 34, 6
 HORIZON = 1000  # control steps of 0.05 s
@@ -150,18 +151,27 @@ def remaining(markers: jax.Array, wiped: jax.Array) -> tuple[jax.Array, jax.Arra
     return jnp.mean(wiped.astype(jnp.float32)), jnp.where(some, radius, 0.0), where
 
 
-def advance(
-    state: WipingState, action: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """One control step of the physics: 25 steps of 2 ms.
+class Moved(NamedTuple):
+    """The arm after a control step of the physics.
 
-    Returns:
-        Joints, speeds, last acceleration, goal rotation, and the force on the wiper, N, in the
-        world's axes.
+    Attributes:
+        joints, speeds, acceleration, goal_rotation: As in `WipingState`.
+        push: [3] force on the wiper, N, in the world's axes.
     """
+
+    joints: jax.Array
+    speeds: jax.Array
+    acceleration: jax.Array
+    goal_rotation: jax.Array
+    push: jax.Array
+
+
+def advance(state: WipingState, action: jax.Array) -> Moved:
+    """One control step of the physics: 25 steps of 2 ms."""
     at = unrolled_linalg.materialize(frames(list(state.joints), WIPER))
     action = jnp.clip(action, -1.0, 1.0)
-    held = tuple(tuple(row) for row in state.goal_rotation)
+    first, second, third = state.goal_rotation
+    held = (tuple(first), tuple(second), tuple(third))
     goal = unrolled_linalg.materialize(
         operational_space.new_goal(list(action), at.position, at.rotation, held)
     )
@@ -171,19 +181,28 @@ def advance(
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
         joints, speeds, acceleration, _ = carry
-        motion = operational_space.free_motion(list(joints), list(speeds), goal, WIPER, weight)
+        motion = operational_space.free_motion(
+            list(joints), list(speeds), goal=goal, tool=WIPER, weight=weight
+        )
         touch = press(motion, table, acceleration)
         speeds = speeds + TIMESTEP * touch.acceleration
         return (joints + TIMESTEP * speeds, speeds, touch.acceleration, touch.force), None
 
     carry = (state.joints, state.speeds, state.acceleration, jnp.zeros(3))
     joints, speeds, acceleration, force = jax.lax.scan(step, carry, None, length=SUBSTEPS)[0]
-    return joints, speeds, acceleration, unrolled_linalg.array(goal[1]), force
+    return Moved(
+        joints=joints,
+        speeds=speeds,
+        acceleration=acceleration,
+        goal_rotation=unrolled_linalg.array(goal[1]),
+        push=force,
+    )
 
 
 def reward_of(
     newly: jax.Array,
     wiped: jax.Array,
+    *,
     markers: jax.Array,
     eef: jax.Array,
     force: jax.Array,
@@ -234,7 +253,12 @@ class TableWiping(ArmTask):
     """Table wiping as pure functions. Build one with `make_table_wiping`."""
 
     name = "table_wiping"
-    spec = EnvSpec(OBSERVATION_SIZE, ACTION_SIZE, MEAN, SCALE)
+    spec = EnvSpec(
+        observation_size=OBSERVATION_SIZE,
+        action_size=ACTION_SIZE,
+        observation_mean=MEAN,
+        observation_scale=SCALE,
+    )
     max_episode_steps = HORIZON
     tool = WIPER
     base = BASE
@@ -264,19 +288,13 @@ class TableWiping(ArmTask):
     ) -> tuple[WipingState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key  # the world is deterministic
-        return self.finish(state, *advance(state, action), params)
+        return self.finish(state, advance(state, action), params)
 
     def finish(
-        self,
-        state: WipingState,
-        joints: jax.Array,
-        speeds: jax.Array,
-        acceleration: jax.Array,
-        goal_rotation: jax.Array,
-        push: jax.Array,
-        params: WipingParams,
+        self, state: WipingState, moved: Moved, params: WipingParams
     ) -> tuple[WipingState, Outcome]:
         """What a control step means, given its physics (see `advance`)."""
+        joints, speeds, acceleration, goal_rotation, push = moved
         physics_diverged = ~jnp.all(
             jnp.isfinite(jnp.concatenate([joints, speeds, acceleration, push]))
         )
@@ -285,13 +303,14 @@ class TableWiping(ArmTask):
             return jnp.where(physics_diverged, old, new)
 
         joints, speeds = sound(joints, state.joints), sound(speeds, state.speeds)
-        moved = state.replace(
+        arm = dataclasses.replace(
+            state,
             joints=joints,
             speeds=speeds,
             acceleration=sound(acceleration, state.acceleration),
             goal_rotation=sound(goal_rotation, state.goal_rotation),
         )
-        at = lagged_frames(moved, WIPER)
+        at = lagged_frames(arm, WIPER)
         turn = unrolled_linalg.array(at.rotation)
         weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass])
         force = sound(-turn @ (push + weight), state.force)
@@ -306,16 +325,17 @@ class TableWiping(ArmTask):
         reward = reward_of(
             jnp.sum(newly),
             wiped,
-            state.markers,
-            jnp.stack(at.position) + BASE,
-            jnp.linalg.norm(state.force),
-            contact,
-            count,
+            markers=state.markers,
+            eef=jnp.stack(at.position) + BASE,
+            force=jnp.linalg.norm(state.force),
+            contact=contact,
+            count=count,
         )
         success = jnp.all(wiped) & ~physics_diverged
         time = state.time + 1
         first = jnp.linalg.norm(state.force_bias) == 0
-        new = moved.replace(
+        new = dataclasses.replace(
+            arm,
             force=force,
             force_bias=jnp.where(first, force, state.force_bias),
             contact=contact,
@@ -373,11 +393,16 @@ class TableWiping(ArmTask):
 def make_params(numbers: range) -> WipingParams:
     """Starts of the scenarios with these numbers."""
 
-    def start(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def start(number: jax.Array) -> tuple[Array, jax.Array]:
         key_joints, key_markers = jax.random.split(jax.random.key(number))
         noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
         return INITIAL_JOINTS + noise, draw_markers(key_markers, _HALF) + jnp.array(_CENTRE)
 
     number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
     joints, markers = jax.jit(jax.vmap(start))(number)
-    return WipingParams(joints.astype(jnp.float32), markers, number, jnp.float32(NORMALISATION))
+    return WipingParams(
+        joints=joints.astype(jnp.float32),
+        markers=markers,
+        number=number,
+        reward_scale=jnp.float32(NORMALISATION),
+    )

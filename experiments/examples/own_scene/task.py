@@ -45,20 +45,25 @@ class Hover(ArmTask):
 
     name = "hover"
     max_episode_steps = 100
-    spec = EnvSpec(6, 6, np.zeros(6, np.float32), np.array([0.1] * 3 + [0.3] * 3, np.float32))
+    spec = EnvSpec(
+        observation_size=6,
+        action_size=6,
+        observation_mean=np.zeros(6, np.float32),
+        observation_scale=np.array([0.1] * 3 + [0.3] * 3, np.float32),
+    )
     tool = PROBE
     base = np.array(BASE, np.float32)
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: HoverParams) -> HoverState:
         """The start of scenario `index`."""
         key_joints, key_goal = jax.random.split(jax.random.key(params.number[index]))
-        joints = INITIAL_JOINTS + INITIAL_NOISE * jax.random.normal(key_joints, (6,))
+        joints = jnp.asarray(INITIAL_JOINTS) + INITIAL_NOISE * jax.random.normal(key_joints, (6,))
         none = jnp.zeros((), jnp.int32)
         return HoverState(
             joints=joints,
             speeds=jnp.zeros(6),
             goal_rotation=site_rotation(joints, PROBE),
-            goal=CENTRE + REACH * jax.random.uniform(key_goal, (3,), minval=-1.0),
+            goal=jnp.asarray(CENTRE) + REACH * jax.random.uniform(key_goal, (3,), minval=-1.0),
             held=none,
             scenario=jnp.asarray(index, jnp.int32),
             time=none,
@@ -74,7 +79,7 @@ class Hover(ArmTask):
     ) -> tuple[HoverState, Outcome]:
         """One control step of 0.05 s: the arm moves, nothing touches it."""
         joints, speeds, rotation = free_steps(
-            state.joints, state.speeds, action, state.goal_rotation, PROBE
+            state.joints, state.speeds, action, held=state.goal_rotation, tool=PROBE
         )
         moved = dataclasses.replace(state, joints=joints, speeds=speeds, goal_rotation=rotation)
         away = jnp.linalg.norm(state.goal - self.grip_position(moved))

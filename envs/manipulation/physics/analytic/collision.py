@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import Frames
+from ppl_jax.types import Array
 
 # body (index into Frames.links; 6 is the hand), ends in its frame, radius, m
 _CAPSULES = (
@@ -47,7 +48,7 @@ def _segment_distance(p: jax.Array, q: jax.Array, r: jax.Array, s: jax.Array) ->
 def arm_hits(
     at: Frames,
     tool_ends: tuple[tuple[float, float, float], tuple[float, float, float]],
-    table: tuple[jax.Array, jax.Array, jax.Array | float],
+    table: tuple[Array, Array, Array | float],
 ) -> jax.Array:
     """Whether a link touches the table, the mount or another link, or the tool the arm.
 

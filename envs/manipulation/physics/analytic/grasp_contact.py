@@ -211,7 +211,7 @@ def hold(
     mover = jnp.concatenate([jnp.concatenate([by_arm, by_finger], -1), none], 1)
     rows = jax.lax.optimization_barrier(jnp.concatenate([mover, by_ring], -1))  # [3, C, 14]
 
-    mass, free = _inertia(motion, ring, fingers, finger_speeds, control)
+    mass, free = _inertia(motion, ring, fingers, finger_speeds, control=control)
     speed = jnp.concatenate([jnp.stack(motion.speeds), finger_speeds, ring.velocity, ring.spin])
     inverse = np.concatenate(
         [np.full(_PADS, 57.2), np.full(2, 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
@@ -230,7 +230,7 @@ def hold(
             lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
             return jnp.concatenate([by_mover, lower])
 
-        return _newton(rows, rest, weight, mass, free, start, curvature)
+        return _newton(rows, rest, weight, mass, free=free, start=start, curvature=curvature)
 
     def apart() -> jax.Array:
         own = rows[:, carried:, 8:]
@@ -239,9 +239,9 @@ def hold(
             rest[:, carried:],
             weight[carried:],
             mass[8:, 8:],
-            free[8:],
-            start[8:],
-            lambda bent: own.reshape(-1, 6).T @ bent.reshape(-1, 6),
+            free=free[8:],
+            start=start[8:],
+            curvature=lambda bent: own.reshape(-1, 6).T @ bent.reshape(-1, 6),
         )
         return jnp.concatenate([free[:8], alone])
 
@@ -258,6 +258,7 @@ def _newton(
     rest: jax.Array,
     weight: jax.Array,
     mass: jax.Array,
+    *,
     free: jax.Array,
     start: jax.Array,
     curvature: Callable[[jax.Array], jax.Array],
@@ -318,6 +319,7 @@ def _inertia(
     ring: Ring,
     fingers: jax.Array,
     finger_speeds: jax.Array,
+    *,
     control: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Mass matrix [14, 14] and the acceleration without contact [14].

@@ -8,9 +8,13 @@ with it. The knuckles are dynamic; the other four joints follow.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+Scalar = Any  # a float, or a traced scalar
 
 RAMP = 0.01  # change of the command per physics step towards the sign of the action
 COMMANDS = np.linspace(0.0, 0.8, 9)
@@ -40,7 +44,7 @@ PAD_HALF = 0.011  # along the hand's x
 PAD_ROWS = np.array([0.01875, 0.006, -0.007])  # along the pad, from its centre to the tip
 
 
-def command_to_control(command: jax.Array) -> jax.Array:
+def command_to_control(command: Scalar) -> Scalar:
     """Position target of the knuckles' servos, rad."""
     return 0.4 + 0.4 * command
 
