@@ -3,20 +3,29 @@
 import csv
 import dataclasses
 import json
+import shutil
 
+import flax.struct
+import jax
 import numpy as np
 import pytest
 
 import envs
 from envs import pretrained
-from experiments.cli import ExpertTrain, main
-from experiments.engine import expert
+from experiments.cli import main, parse
+from experiments.engine import expert, expert_settings
 from experiments.engine.evaluate import make_world, named_expert, named_policy, summarise_episodes
+from experiments.engine.expert_settings import ExpertSettings, read_settings, settings_for
 from experiments.engine.policy_file import load_policy, save_policy
+from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
+from experiments.options.expert import command_of, new_settings
 from experiments.report import card, figures
+from ppl_jax import cards, checkpoint
+from ppl_jax.cards import EnvCard, ExpertCard
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.ppo.config import PPOConfig, PPOHParams, read
+from ppl_jax.ppo.config import OLD_NAMES, PPOConfig, PPOHParams, catalogue, read
+from ppl_jax.ppo.loop import make_ppo_lagrangian
 from tests.helpers import Probe, outcome
 
 if "probe" not in envs.registered():
@@ -48,8 +57,7 @@ def test_a_run_leaves_what_is_needed_to_go_on_and_to_make_it_again(run, capsys):
     for name in ("episodic_return", "episodic_cost", "multiplier", "success_rate", "divergence"):
         assert all(f"train/{name}" in row for row in rows[1:])
     assert "eval/success_rate" in rows[-1]
-    config = json.loads((run / "config.json").read_text())
-    assert card.command_of(config).startswith(
+    assert command_of(read_settings(RunFolder(run))).startswith(
         "ppl expert train probe --total-steps 1024 --num-envs 8"
     )
     summary = json.loads((run / "summary.json").read_text())
@@ -95,12 +103,12 @@ def test_a_card_replaces_nothing(run, tmp_path, capsys):
 def test_settings_of_shipped_cards_are_read_under_their_old_names():
     for name in SHIPPED:
         told = json.loads(pretrained.policy_path(name).with_suffix(".json").read_text())
-        assert read(told["config"], told["hparams"]) == expert.settings_for(name)[:2]
+        assert read(told["config"] | told["hparams"]) == settings_for(name)[:2]
     with pytest.raises(ValueError, match="unknown settings of PPO-Lagrangian: speed"):
-        read({"speed": 1}, {})
+        read({"speed": 1})
 
 
-def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch):
+def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch, capsys):
     out = tmp_path / "stopped"
     save, calls = expert._Run._save, []
 
@@ -113,8 +121,9 @@ def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch):
     monkeypatch.setattr(expert._Run, "_save", save_and_stop)
     with pytest.raises(SystemExit):
         main(["expert", "train", "probe", *WORDS, "--out", str(out)])
+    assert f"continue with: ppl expert train --resume --out {out}\n" in capsys.readouterr().err
     assert not (out / "summary.json").exists()
-    main(["expert", "train", "probe", *WORDS, "--out", str(out), "--resume"])
+    main(["expert", "train", "--resume", "--out", str(out)])  # its settings are in the folder
     assert calls == [256, 512, 768, 1024]
     assert outcome(out) == outcome(run)
     main(["expert", "train", "probe", *WORDS, "--out", str(out), "--resume"])  # complete already
@@ -134,7 +143,16 @@ def test_a_run_that_was_stopped_goes_on_as_if_never(run, tmp_path, monkeypatch):
         ),
         (["train", "probe", "--cost-limit", "-1"], "cost_limit must be a number of 0 or more"),
         (["train", "probe", "--evaluate-every", "0"], "evaluate_every must be at least 1, got 0"),
+        (["train", "probe", "--seed", "4294967296"], "seed must be at most 4294967295"),
+        (["train", "probe", "--clip", "inf"], "clip must be positive, got inf"),
+        (["train"], "env: name the environment, one of driving"),
+        (["train", "--out", "driving", "probe"], "env: name 'probe' before the options"),
         (["train", "probe", "--resume"], "--resume needs --out"),
+        (["train", "--resume", "--out", "no/run"], "'no/run' is not a run folder"),
+        *(
+            (["train", "probe", f"--{old.replace('_', '-')}", "1"], f"{old} is called {new} now")
+            for old, new in OLD_NAMES.items()
+        ),
         (["train", "driving", "--scenarios", "no/folder"], "'no/folder' does not exist"),
         (["evaluate", "probe"], "no neural expert is shipped for 'probe'"),
         (["evaluate", "probe", "--kind", "no.npz"], "policy file 'no.npz' cannot be read"),
@@ -151,22 +169,157 @@ def test_a_mistake_is_one_clear_line(words, message, capsys, tmp_path, monkeypat
     assert len(told.splitlines()) == 1
 
 
+def of_schema_1(run, out):
+    """A copy of a run folder as versions before config.json had a schema wrote it."""
+    shutil.copytree(run, out)
+    (out / "summary.json").unlink()
+    content = json.loads((out / "config.json").read_text())
+    old_names = {new: old for old, new in OLD_NAMES.items()}
+    parts = {"config": {}, "hparams": {}}
+    for name, one in catalogue(PPOConfig(), PPOHParams()).items():
+        part = parts["hparams" if one.traced else "config"]
+        part[old_names.get(name, name)] = content["settings"][name]
+    content = {k: v for k, v in content.items() if k not in ("schema", "settings")} | parts
+    (out / "config.json").write_text(json.dumps(content))
+    return list(parts["hparams"])
+
+
+def test_a_run_of_an_earlier_version_is_read_and_continued(run, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "old"
+    names = of_schema_1(run, out)
+    assert read_settings(RunFolder(out)) == read_settings(RunFolder(run))
+    shutil.rmtree(out / "checkpoints" / "step_1024")
+    env, settings = make_world("probe", {}), read_settings(RunFolder(out))
+    functions = make_ppo_lagrangian(env, settings.config, expert=env.experts["scripted"])
+    like = jax.jit(functions.init)(jax.random.key(0), settings.hparams)
+    done, learner = checkpoint.restore(out / "checkpoints", like, print)
+    then = flax.struct.dataclass(type("Then", (), {"__annotations__": dict.fromkeys(names, float)}))
+    held = dict(zip(names, jax.tree.leaves(learner.hparams), strict=True))
+    checkpoint.save(out / "checkpoints", done, dataclasses.replace(learner, hparams=then(**held)))
+    main(["expert", "train", "--resume", "--out", str(out)])
+    assert "damaged" not in capsys.readouterr().err
+    assert outcome(out) == outcome(run)
+    with pytest.raises(SystemExit):
+        main(["expert", "train", "--resume", "--out", str(out), "--gae-lambda", "0.5"])
+    assert "its gae_lambda is 0.95, asked for 0.5" in capsys.readouterr().err
+
+
+# --- the command line ---
+
+
+def words_of(settings):
+    return command_of(settings).split()[1:]
+
+
 def test_every_setting_has_its_option():
-    options = {field.name for field in dataclasses.fields(ExpertTrain)}
-    for record in (PPOConfig, PPOHParams):
-        assert {field.name for field in dataclasses.fields(record)} <= options
+    changed = ExpertSettings(
+        env="driving",
+        seed=3,
+        config=PPOConfig(
+            total_steps=1000,
+            num_envs=4,
+            rollout_steps=8,
+            epochs=2,
+            num_minibatches=2,
+            hidden=(64, 64),
+            scaling="world",
+            demonstrations=7,
+            demonstration_stride=2,
+            demonstration_rounds=3,
+            cloning="gaussian",
+            cloning_updates=9,
+            guided=False,
+            critic_batches=4,
+        ),
+        hparams=PPOHParams(
+            **{field.name: 0.375 for field in dataclasses.fields(PPOHParams)},
+        ),
+        training_scenarios=5,
+        held_out_scenarios="a/folder",
+        evaluate_every=6,
+    )
+    words = words_of(changed)
+    for name in catalogue(changed.config, changed.hparams):
+        option = name.replace("_", "-")
+        assert f"--{option}" in words or f"--no-{option}" in words
+    assert parse(words).settings == changed
 
 
-def test_other_settings_are_refused(run):
-    with pytest.raises(UserError, match="its hparams is"):
-        expert.train_expert(
-            expert.ExpertSettings("probe", 0, *_settings(run)[:1], PPOHParams(clip=0.3)), run, True
-        )
+@pytest.mark.parametrize("name", [*SHIPPED, "probe"])
+def test_a_run_has_the_settings_of_its_environments_card(name):
+    asked = parse(["expert", "train", name]).settings
+    config, hparams, scenarios = settings_for(name)
+    assert asked == new_settings(name)
+    assert (asked.config, asked.hparams, asked.training_scenarios) == (config, hparams, scenarios)
+    assert command_of(asked) == f"ppl expert train {name}"
+    told = cards.card(name).expert
+    for field, value in {**told.config, **told.hparams}.items():
+        assert catalogue(config, hparams)[field].value == value
 
 
-def _settings(run):
-    config = json.loads((run / "config.json").read_text())["config"]
-    return PPOConfig(**(config | {"hidden": tuple(config["hidden"])})), PPOHParams()
+def test_defaults_that_depend_on_what_is_given():
+    asked = parse(["expert", "train", "driving", "--scenarios", "a", "--total-steps", "5000000"])
+    assert asked.settings.training_scenarios == 0
+    assert asked.settings.evaluate_every == 306 // 40
+    assert words_of(asked.settings)[2:] == words_of(parse(words_of(asked.settings)).settings)[2:]
+    asked = parse(["expert", "train", "driving", "--total-steps", "5000000", "--evaluate-every=1"])
+    assert asked.settings.evaluate_every == 1
+
+
+def test_a_card_that_names_no_setting_is_refused(monkeypatch):
+    wrong = EnvCard(expert=ExpertCard(hparams={"cost_limits": 1.0}))
+    monkeypatch.setattr(expert_settings, "card", lambda name: wrong)
+    with pytest.raises(UserError, match=r"the card of probe: unknown settings .*: cost_limits"):
+        settings_for("probe")
+
+
+def help_of(capsys, *words):
+    with pytest.raises(SystemExit) as error:
+        main(["expert", "train", *words])
+    assert error.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_shows_what_a_run_would_use(capsys, run):
+    common = help_of(capsys, "driving", "--help")
+    assert len(common.splitlines()) <= 85
+    for shown in ("288 288 288", "(default: 14400000)", "(default: 8000)", "(default: True)"):
+        assert shown in common
+    assert "command." not in common
+    assert "--demonstration-rounds" not in common
+    everything = help_of(capsys, "driving", "--help-all")
+    for name in catalogue(PPOConfig(), PPOHParams()):
+        assert f"--{name.replace('_', '-')}" in everything
+    assert "(default: 24)" in everything
+    assert "(default: 10000000)" in help_of(capsys, "table_wiping", "--help")
+    assert "(default: 1024)" in help_of(capsys, "--resume", "--out", str(run), "--help")
+
+
+def test_a_wrong_option_names_the_nearest(capsys):
+    with pytest.raises(SystemExit) as error:
+        main(["expert", "train", "probe", "--cliip", "0.1"])
+    assert error.value.code == 2
+    told = capsys.readouterr()
+    assert "--clip" in told.out + told.err
+
+
+def test_other_settings_are_refused_one_by_one(run, capsys):
+    settings = read_settings(RunFolder(run))
+    other = dataclasses.replace(settings, hparams=PPOHParams(clip=0.3))
+    with pytest.raises(UserError, match=r"its clip is 0\.2, asked for 0\.3$"):
+        expert.train_expert(other, run, True)
+    for words, message in (
+        (
+            ["--hidden", "4", "4", "--clip", "0.3"],
+            ": its clip is 0.2, asked for 0.3; its hidden is (8,), asked for (4, 4)\n",
+        ),
+        (["driving"], ": its env is 'probe', asked for 'driving'\n"),
+        (["--evaluate-every", "2"], ": its evaluate_every is 1, asked for 2\n"),
+    ):
+        with pytest.raises(SystemExit) as error:
+            main(["expert", "train", "--resume", "--out", str(run), *words])
+        assert error.value.code == 2
+        assert message in capsys.readouterr().err
 
 
 # --- policy files ---
