@@ -65,10 +65,10 @@ class Result:
         pyplot = need("matplotlib.pyplot", "plot", "plot()")
         _, axes = pyplot.subplots()
         names = [name for name in self.axes if name != "seed"]
-        groups = self.curve.groupby(names, sort=False) if names else [((), self.curve)]
+        groups: Any = self.curve.groupby(names, sort=False) if names else [((), self.curve)]
         count = 0
         for values, rows in groups:
-            by_step = rows.groupby("step")[column]
+            by_step: Any = rows.groupby("step")[column]
             label = ", ".join(f"{k} = {v:g}" for k, v in zip(names, values, strict=True))
             (line,) = axes.plot(by_step.mean(), label=label or None)
             axes.fill_between(
