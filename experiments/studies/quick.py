@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import numbers
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from experiments.engine.runtime import UserError, need, start_jax
 from experiments.engine.settings import RunSettings, check, run_settings
-from ppl_jax.config import catalogue, replace
+from ppl_jax.config import Setting, catalogue, replace
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,7 +111,7 @@ def train(
     Args:
         env: Name of the environment.
         method: Name of the method.
-        seed: A seed, or several.
+        seed: A seed, or several: a list, a range or an array.
         preset: "default", "paper" or "reference".
         expert: "scripted", "neural", a policy file or a run folder.
         evaluate_every: Environment steps between evaluations; a tenth of the run where None.
@@ -142,21 +143,20 @@ def _train(
     given: Mapping[str, Any],
 ) -> Result:
     start_jax()
-    seeds = tuple(int(one) for one in np.atleast_1d(seed))
-    swept = {k: tuple(np.asarray(v).tolist()) for k, v in given.items() if _several(v)}
-    one = {k: v for k, v in given.items() if k not in swept}
-    common = {"preset": preset, "expert": expert, "evaluate_every": evaluate_every}
+    seeds = _seeds(seed)
+    owners = {k: v for k, v in given.items() if k in ("gate", "predictor") and isinstance(v, str)}
+    plain = run_settings(env, method, preset=preset, given=owners)
+    one, swept = _split(given, catalogue(plain.config, plain.hparams))
     # the largest value first: it sets what bounds the others, such as the number of pairs
     widest = run_settings(
-        env, method, seeds[0], given={**one, **{k: max(v) for k, v in swept.items()}}, **common
+        env,
+        method,
+        seeds[0],
+        preset=preset,
+        expert=expert,
+        evaluate_every=evaluate_every,
+        given={**one, **{k: max(v) for k, v in swept.items()}},
     )
-    known = catalogue(widest.config, widest.hparams)
-    for name in swept:
-        if not known[name].traced:
-            raise UserError(
-                f"{name} sets the program and cannot be a list here: call train once for each "
-                f"value, or use `ppl sweep`"
-            )
     points = [
         dict(zip(swept, chosen, strict=True)) for chosen in itertools.product(*swept.values())
     ]
@@ -171,11 +171,69 @@ def _train(
     return _result(settings, {**swept, "seed": seeds}, histories, layers, numbers=numbers)
 
 
-def _several(value: Any) -> bool:
-    """Whether a setting was given several values; widths of layers are one."""
-    if isinstance(value, tuple):
-        return False
-    return isinstance(value, list) or getattr(value, "ndim", 0) == 1
+def _several(name: str, value: Any) -> list[Any] | None:
+    """The values of a list, tuple, range or array; None where there is one value."""
+    if isinstance(value, str) or not np.ndim(value):
+        return None
+    found = [one.item() if np.ndim(one) == 0 and hasattr(one, "item") else one for one in value]
+    if not found or any(np.ndim(one) for one in found):
+        shown = " ".join(repr(value).split())  # an array's has several lines
+        raise UserError(f"{name} must be one value or a flat list of values, got {shown}")
+    return found
+
+
+def _seeds(seed: Any) -> tuple[int, ...]:
+    several = _several("seed", seed)
+    found = [seed] if several is None else several
+    for one in found:
+        if isinstance(one, bool) or not isinstance(one, numbers.Integral):
+            raise UserError(f"seed must be a whole number or several, got {one!r}")
+    return tuple(int(one) for one in found)
+
+
+def _split(
+    given: Mapping[str, Any], known: Mapping[str, Setting]
+) -> tuple[dict[str, Any], dict[str, tuple[Any, ...]]]:
+    """Settings that were given one value, and those that were given several.
+
+    Raises:
+        UserError: If a value is not of the setting's kind, or the setting takes one value alone.
+    """
+    one: dict[str, Any] = {}
+    swept: dict[str, tuple[Any, ...]] = {}
+    for name, value in given.items():
+        if name not in known:  # `run_settings` refuses it
+            one[name] = value
+            continue
+        setting, several = known[name], _several(name, value)
+        if isinstance(setting.value, tuple):  # widths of layers: one value is a list already
+            one[name] = value if several is None else tuple(several)
+        elif several is None:
+            one[name] = value.item() if np.ndim(value) == 0 and hasattr(value, "item") else value
+            _check_kind(setting, one[name])
+        elif not setting.traced:
+            raise UserError(
+                f"{name} sets the program and cannot be a list here: call train once for each "
+                f"value, or use `ppl sweep`"
+            )
+        else:
+            for each in several:
+                if isinstance(each, str):
+                    raise UserError(f"{name} must be numbers where it is a list, got {each!r}")
+                _check_kind(setting, each)
+            swept[name] = tuple(several)
+    return one, swept
+
+
+def _check_kind(setting: Setting, value: Any) -> None:
+    """Refuse what is no number, or no whole one, where a setting is one."""
+    if setting.kind not in (int, float) or (isinstance(value, str) and setting.about.choices):
+        return
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise UserError(f"{setting.name} must be a number, got {value!r}")
+    whole = setting.kind is int and not setting.traced
+    if whole and not isinstance(value, numbers.Integral):
+        raise UserError(f"{setting.name} must be a whole number, got {value!r}")
 
 
 def _run(widest: RunSettings, settings: list[RunSettings]) -> tuple[Any, Any, Any]:

@@ -8,6 +8,7 @@ import pytest
 import envs
 from experiments.engine.run import RunSettings, train
 from experiments.report import paper, tables
+from experiments.report.points import read_points
 from experiments.studies.ablation import LIBRARY, ROWS
 from experiments.studies.tune import points
 from ppl_jax import algorithms, checkpoint
@@ -166,5 +167,5 @@ def test_the_example_of_an_own_method_runs_from_outside(tmp_path):
     words = ["compare", "probe", "--algorithms", "ppl", "focused", "--seeds", "1"]
     words += ["--total-steps", "400", "--batch-size", "32", "--out", tmp_path / "c"]
     call(script, *words)
-    found = tables.read_episodes(tmp_path / "c" / "episodes.csv")
-    assert np.mean(found["focused"]["success"]) > 0.4
+    found = {point.algorithm: point for point in read_points(tmp_path / "c")}
+    assert found["focused"].interval("success").mean > 0.4
