@@ -219,7 +219,16 @@ def test_lookahead_is_the_world_and_leaves_no_trace(name):
     before = jax.tree.map(np.array, state)
     action = expert_action(name)(state)
     ahead = jax.jit(
-        lambda s, a: predict(env, env.transition, KEY, s, a, env.default_params, 5, observe=True)
+        lambda s, a: predict(
+            env,
+            env.transition,
+            KEY,
+            s,
+            action=a,
+            params=env.default_params,
+            horizon=5,
+            observe=True,
+        )
     )(state, action)
     close(state, before, 0)
     for k in range(5):
