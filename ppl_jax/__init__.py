@@ -25,16 +25,13 @@ _NAMES = {
     "read_points": "experiments.report.points",
     "difference": "experiments.report.points",
     "EnvCard": "ppl_jax.cards",
-    "card": "ppl_jax.cards",
     "EnvSpec": "ppl_jax.types",
     "Outcome": "ppl_jax.types",
     "TrainConfig": "ppl_jax.config",
     "HParams": "ppl_jax.config",
-    "validate": "ppl_jax.config",
     "setting": "ppl_jax.fields",
     "settings": "ppl_jax.algorithms.registry",
     "Algorithm": "ppl_jax.algorithms.base",
-    "method": "ppl_jax.algorithms.registry",
     "register_method": "ppl_jax.algorithms.registry",
     "registered_methods": "ppl_jax.algorithms.registry",
     "register_gate": "ppl_jax.gates",
@@ -53,11 +50,11 @@ _RENAMED = {"register_method": "register", "registered_methods": "registered"}
 
 if TYPE_CHECKING:
     from ppl_jax.algorithms.base import Algorithm
-    from ppl_jax.algorithms.registry import method, settings
     from ppl_jax.algorithms.registry import register as register_method
     from ppl_jax.algorithms.registry import registered as registered_methods
-    from ppl_jax.cards import EnvCard, card
-    from ppl_jax.config import HParams, TrainConfig, validate
+    from ppl_jax.algorithms.registry import settings
+    from ppl_jax.cards import EnvCard
+    from ppl_jax.config import HParams, TrainConfig
     from ppl_jax.evaluation import make_evaluate
     from ppl_jax.fields import setting
     from ppl_jax.gates import register_gate
@@ -89,7 +86,6 @@ __all__ = [
     "TrainConfig",
     "__version__",
     "bc_loss",
-    "card",
     "difference",
     "load_policy",
     "main",
@@ -97,7 +93,6 @@ __all__ = [
     "make_evaluate",
     "make_live",
     "make_train",
-    "method",
     "pair_likelihoods",
     "predict",
     "preference_loss",
@@ -113,7 +108,6 @@ __all__ = [
     "setting",
     "settings",
     "train",
-    "validate",
 ]
 
 

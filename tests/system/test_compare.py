@@ -167,11 +167,5 @@ def test_the_example_of_an_own_method_runs_from_outside(tmp_path):
     words = ["compare", "probe", "--algorithms", "ppl", "focused", "--seeds", "1"]
     words += ["--total-steps", "400", "--batch-size", "32", "--out", tmp_path / "c"]
     call(script, *words)
-<<<<<<< HEAD
     found = {point.algorithm: point for point in read_points(tmp_path / "c")}
     assert found["focused"].interval("success").mean > 0.4
-=======
-    rows = csv.DictReader((tmp_path / "c" / "episodes.csv").read_text().splitlines())
-    played = [float(row["success"]) for row in rows if row["algorithm"] == "focused"]
-    assert np.mean(played) > 0.4
->>>>>>> types
