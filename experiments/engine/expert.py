@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import flax.struct
 import jax
 import numpy as np
 
@@ -30,7 +29,7 @@ from experiments.engine.expert_settings import (
 )
 from experiments.engine.policy_file import save_policy
 from experiments.engine.progress import Progress
-from experiments.engine.run import open_folder, restore_learner
+from experiments.engine.run import open_folder, record_of, restore_learner
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import one_level, refuse_contradictions
@@ -108,11 +107,9 @@ def _restore(folder: RunFolder, learner: PPOLearner) -> tuple[int, PPOLearner]:
     content = folder.config()
     if "schema" in content:
         return restore_learner(folder, learner)
-    names = list(content["hparams"])  # in the order of the checkpoint
-    then = type("HParamsThen", (), {"__annotations__": dict.fromkeys(names, jax.Array)})
     zero = jax.numpy.zeros((), jax.numpy.float32)
-    zeros = flax.struct.dataclass(then)(**dict.fromkeys(names, zero))
-    like = dataclasses.replace(learner, hparams=zeros)
+    hparams = record_of(dict.fromkeys(content["hparams"], zero))  # in the order of the checkpoint
+    like = dataclasses.replace(learner, hparams=hparams)
     done, found = restore_learner(folder, like)
     return done, dataclasses.replace(found, hparams=learner.hparams)
 

@@ -7,10 +7,11 @@ import functools
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import flax.struct
 import jax
 import numpy as np
 
@@ -257,17 +258,27 @@ def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
     """
     if "hparams" in folder.config() and hasattr(learner, "counters"):
         names = {f.name: _OLD_COUNTERS.get(f.name, f.name) for f in dataclasses.fields(Counters)}
+        zero = jax.numpy.zeros((), jax.numpy.float32)
         old = dataclasses.replace(
             learner,
-            hparams={name: jax.numpy.zeros((), jax.numpy.float32) for name in _OLD_HPARAMS},
-            counters={before: getattr(learner.counters, name) for name, before in names.items()},
+            hparams=record_of(dict.fromkeys(_OLD_HPARAMS, zero)),
+            counters=record_of({then: getattr(learner.counters, n) for n, then in names.items()}),
         )
         done, found = _restore(folder, old)
         if found is old:
             return 0, learner
-        counters = Counters(**{name: found.counters[before] for name, before in names.items()})
+        counters = Counters(**{n: getattr(found.counters, then) for n, then in names.items()})
         return done, dataclasses.replace(found, hparams=learner.hparams, counters=counters)
     return _restore(folder, learner)
+
+
+def record_of(values: Mapping[str, Any]) -> Any:
+    """A pytree with these fields, in this order.
+
+    A checkpoint's checksum depends on the order, and a dict would be sorted.
+    """
+    kind = type("Then", (), {"__annotations__": dict.fromkeys(values, jax.Array)})
+    return flax.struct.dataclass(kind)(**values)
 
 
 def _restore(folder: RunFolder, learner: Any) -> tuple[int, Any]:

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import shutil
 
-import flax.struct
 import jax
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from experiments.engine import expert, expert_settings
 from experiments.engine.evaluate import make_world, named_expert, named_policy, summarise_episodes
 from experiments.engine.expert_settings import ExpertSettings, read_settings, settings_for
 from experiments.engine.policy_file import load_policy, save_policy
+from experiments.engine.run import record_of
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.options.expert import command_of, new_settings
@@ -192,16 +192,22 @@ def test_a_run_of_an_earlier_version_is_read_and_continued(run, tmp_path, monkey
     env, settings = make_world("probe", {}), read_settings(RunFolder(out))
     functions = make_ppo_lagrangian(env, settings.config, expert=env.experts["scripted"])
     like = jax.jit(functions.init)(jax.random.key(0), settings.hparams)
-    done, learner = checkpoint.restore(out / "checkpoints", like, print)
-    then = flax.struct.dataclass(type("Then", (), {"__annotations__": dict.fromkeys(names, float)}))
-    held = dict(zip(names, jax.tree.leaves(learner.hparams), strict=True))
-    checkpoint.save(out / "checkpoints", done, dataclasses.replace(learner, hparams=then(**held)))
+    found = checkpoint.restore(out / "checkpoints", like, print)
+    assert found is not None
+    done, learner = found
+    held = record_of(dict(zip(names, jax.tree.leaves(learner.hparams), strict=True)))
+    checkpoint.save(out / "checkpoints", done, dataclasses.replace(learner, hparams=held))
     main(["expert", "train", "--resume", "--out", str(out)])
     assert "damaged" not in capsys.readouterr().err
     assert outcome(out) == outcome(run)
     with pytest.raises(SystemExit):
         main(["expert", "train", "--resume", "--out", str(out), "--gae-lambda", "0.5"])
     assert "its gae_lambda is 0.95, asked for 0.5" in capsys.readouterr().err
+
+
+def test_a_record_keeps_the_order_of_its_fields():
+    leaves = jax.tree.leaves(record_of({"rate": np.zeros(1), "clip": np.ones(1)}))
+    assert [float(leaf[0]) for leaf in leaves] == [0.0, 1.0]
 
 
 # --- the command line ---
