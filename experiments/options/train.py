@@ -190,6 +190,7 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
     if not parsed.env:
         raise UserError(f"env: name the environment, one of {environments()}")
     expert = flat_options["expert"]
+    asked = {*given, *_DECIDING}
     settings = run_settings(
         parsed.env,
         flat_options["algorithm"],
@@ -201,9 +202,10 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
         held_out_scenarios=flat_options["held_out_scenarios"],
         evaluate_on=flat_options["evaluate_on"],
         evaluate_every=given.get("evaluate_every"),
-        given={k: v for k, v in given.items() if k not in _NOT_SETTINGS},
+        given={k: flat_options[k] for k in flat_options if k in asked and k not in _NOT_SETTINGS},
     )
     return TrainRequest(settings=settings, out=out, resume=False)
 
 
+_DECIDING = ("gate", "predictor")  # the defaults of others depend on them, as shown
 _NOT_SETTINGS = {name for group in _OWN.values() for name, _, _, _ in group}

@@ -252,8 +252,9 @@ def test_a_sweep_that_is_killed_goes_on_to_the_same_results(tmp_path):
     told = sweep(tmp_path, "killed", *words)  # and once more: nothing to do, nothing changed
     assert "12 of them done" in told.stderr
     assert {name: (out / name).read_bytes() for name in FILES} == whole
-    told = sweep(tmp_path, "killed", *words, "--learning-rate", "0.5", code=2)
+    told = sweep(tmp_path, "killed", *words, "--preset", "paper", code=2)
     assert "give another --out" in told.stderr
+    assert {name: (out / name).read_bytes() for name in FILES} == whole
 
 
 FILES = ("results.csv", "episodes.csv")

@@ -557,14 +557,20 @@ def test_a_variant_fails_where_theory_says_so(case):
 
 
 def test_demonstrations_do_not_teach_to_come_back_and_interventions_do():
-    """Covariate shift: in its own episodes the expert never strays."""
+    """Covariate shift: in its own episodes the expert never strays.
+
+    Half of the clones extrapolate well enough by chance, so a single seed says nothing.
+    """
     results = {}
     for name in ("bc", "hg_dagger"):
         probe = Balance()
         fns, hparams = functions(name, probe)
-        learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-        results[name] = success(probe, fns, learner)
-    assert results == {"bc": 0.0, "hg_dagger": 1.0}
+        train = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))
+        learners, _ = train(jax.random.split(jax.random.key(0), 20), hparams)
+        each = [jax.tree.map(lambda leaf, i=i: leaf[i], learners) for i in range(20)]
+        results[name] = np.mean([success(probe, fns, learner) for learner in each])
+    assert results["bc"] <= 0.8
+    assert results["hg_dagger"] >= 0.95
 
 
 @pytest.mark.parametrize(("correction", "solves"), [(1.0, True), (0.0, False)])

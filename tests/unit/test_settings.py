@@ -8,6 +8,7 @@ import flax.struct
 import pytest
 
 import ppl_jax
+from experiments.cli import parse
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, flat, one_level, run_settings, with_values
 from experiments.options.seeds import parse_seeds
@@ -227,3 +228,23 @@ def test_settings_classes_are_frozen():
     for part in (config, config.method, hparams, hparams.method, hparams.gate):
         with pytest.raises(dataclasses.FrozenInstanceError):
             part.x = 1
+
+
+@pytest.mark.parametrize(
+    ("words", "setting", "value"),
+    [
+        (["--gate", "low_return"], "gate", "low_return"),
+        (["--gate", "low_return", "--min-return", "3"], "min_return", 3.0),
+        (["--gate=deviates_from_expert"], "gate", "deviates_from_expert"),
+        (["--predictor", "kinematic"], "predictor", "kinematic"),
+        (["--total-steps", "400"], "total_steps", 400),
+        (["--hidden", "64", "64"], "hidden", (64, 64)),
+        (["--algorithm", "thrifty_dagger", "--switch-rate", "0.2"], "switch_rate", 0.2),
+    ],
+)
+def test_an_option_of_train_reaches_the_run(words, setting, value):
+    settings = parse(["train", "driving", *words]).settings
+    found = values(settings.config, settings.hparams)
+    assert found[setting] == value
+    untouched = parse(["train", "driving"]).settings
+    assert values(untouched.config, untouched.hparams).get(setting) != value

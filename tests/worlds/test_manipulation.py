@@ -14,7 +14,8 @@ from envs.manipulation.physics.analytic import arm, grasp_contact, wipe_contact
 from envs.manipulation.scenes.model import GRIPPER, INITIAL_JOINTS, TIMESTEP, WIPER
 from envs.manipulation.tasks import nut, wiping
 from envs.manipulation.tasks.markers import COUNT, SPACING, draw_markers
-from ppl_jax.config import PRESETS
+from ppl_jax import algorithms
+from ppl_jax.config import values
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.predictors import predict
 
@@ -390,13 +391,14 @@ def test_contact_rows_of_the_grasp_are_velocities():
 
 
 def test_presets_of_the_tasks():
-    config, hparams = PRESETS["paper"]("table_wiping")
-    assert (config.total_steps, config.gate) == (4000, "low_return")
-    assert (hparams.preference_horizon, hparams.min_return) == (4, 1.0)
-    config, hparams = PRESETS["default"]("nut_assembly")
-    assert (config.total_steps, hparams.preference_horizon, hparams.min_return) == (200_000, 6, 2.0)
-    with pytest.raises(ValueError, match="driving alone"):
-        PRESETS["reference"]("table_wiping")
+    found = values(*algorithms.settings("ppl", "table_wiping", "paper"))
+    assert (found["total_steps"], found["gate"]) == (4000, "low_return")
+    assert (found["preference_horizon"], found["min_return"]) == (4, 1.0)
+    found = values(*algorithms.settings("ppl", "nut_assembly"))
+    names = ("total_steps", "preference_horizon", "min_return")
+    assert [found[name] for name in names] == [200_000, 6, 2.0]
+    with pytest.raises(ValueError, match="is not for table_wiping: choose default or paper"):
+        algorithms.settings("ppl", "table_wiping", "reference")
 
 
 # ---- against robosuite
