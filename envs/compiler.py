@@ -1,4 +1,4 @@
-"""XLA settings under which these worlds run fast on a CPU."""
+"""XLA settings under which these environments run fast on a CPU."""
 
 from __future__ import annotations
 

@@ -283,14 +283,14 @@ def _expert_train(request: Any) -> None:
 
 
 def _expert_evaluate(command: ExpertEvaluate) -> None:
-    from experiments.engine.evaluate import make_world
+    from experiments.engine.evaluate import make_env
     from experiments.engine.expert import evaluate_expert
     from experiments.engine.runtime import start_jax
     from experiments.report.tables import print_evaluation, write_rows
 
     start_jax()
     options = {} if command.scenarios is None else {"held_out_scenarios": command.scenarios}
-    rows = evaluate_expert(make_world(command.env, options), command.kind)
+    rows = evaluate_expert(make_env(command.env, options), command.kind)
     if command.out is not None:
         write_rows(command.out, [row._asdict() for row in rows])
     print_evaluation(f"{command.kind} expert", rows)
@@ -312,7 +312,7 @@ def _render(command: Render) -> None:
     from experiments.report.film import render
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps, world=command.env)
+    render(command.run, command.scenario, command.out, command.steps, env_name=command.env)
     print(f"wrote {command.out}")
 
 

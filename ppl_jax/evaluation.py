@@ -35,8 +35,8 @@ class Episodes(NamedTuple):
 def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
     """`evaluate(params, key) -> Episodes`, pure and jittable.
 
-    `act` is called on one world at a time; it never sees anything of the expert. Episodes run in
-    lock step until the last has ended.
+    `act` is called on one environment at a time; it never sees anything of the expert. Episodes run
+    in lock step until the last has ended.
     """
     sequential_on_cpu = env.sequential_on_cpu and jax.default_backend() == "cpu"
 

@@ -52,7 +52,7 @@ class Learner:
 
     Attributes:
         algorithm: The method's own state (parameters, optimiser, buffers).
-        env_state: The world.
+        env_state: The environment.
         takeover: The expert is in control.
         key: Random key.
         hparams: The run's hyper-parameters.
@@ -100,14 +100,14 @@ def make_steps(
     """Build them.
 
     Args:
-        env: The world.
+        env: The environment.
         expert: Acts during takeovers; None where somebody outside does.
         algorithm: The method.
         config: Static settings.
-        params: The world's parameters.
+        params: The environment's parameters.
 
     Raises:
-        ValueError: If the world lacks the predictor that `config` names.
+        ValueError: If the environment lacks the predictor that `config` names.
     """
     predicted_transition = predictor(config.predictor).make(env)
 

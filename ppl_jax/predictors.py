@@ -39,7 +39,7 @@ def predict(
 
     Args:
         env: For observations.
-        transition: The world's own, or another (see `ppl_jax.types.Transition`).
+        transition: The environment's own, or another (see `ppl_jax.types.Transition`).
         key: For a random transition.
         state: Start.
         action: [A] held through the prediction, or only its first action where `act` is given.

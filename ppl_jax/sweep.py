@@ -66,7 +66,7 @@ def make_run(
     program.
 
     Args:
-        env: The world; its held-out parameters are an argument of the run, not a constant.
+        env: The environment; its held-out parameters are an argument of the run, not a constant.
         functions: The method's functions (`ppl_jax.training.make_train`).
         config: Static settings.
         keep_policy: Return (RunHistory, the policy's layers at the end) instead.
@@ -147,7 +147,7 @@ def split(batch: PyTree, devices: list[Any]) -> PyTree:
 
 
 def run_bytes(functions: TrainFunctions, hparams: HParams) -> int:
-    """Memory that one run's state takes, bytes: its buffers, parameters and world."""
+    """Memory that one run's state takes, bytes: its buffers, parameters and environment."""
     learner = jax.eval_shape(functions.init, jax.random.key(0), hparams)
     leaves = jax.tree.leaves(learner)
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)

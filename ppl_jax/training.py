@@ -72,15 +72,15 @@ def make_train(
     `jax.vmap(train)(keys, hparams)` trains a batch: over seeds, L, beta, noise, in one program.
 
     Args:
-        env: The world.
+        env: The environment.
         expert: Acts during takeovers.
         make_algorithm: `ppl_jax.algorithms.method(name).make`, or one's own.
         config: Static settings; check them with `ppl_jax.config.validate` first.
-        env_params: The world's parameters; its training ones where None.
+        env_params: The environment's parameters; its training ones where None.
 
     Raises:
-        ValueError: If the world lacks the predictor that `config` names, the expert the density
-            that its gate needs, or the run's length does not fit the method's rounds.
+        ValueError: If the environment lacks the predictor that `config` names, the expert the
+            density that its gate needs, or the run's length does not fit the method's rounds.
     """
     params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)

@@ -1,1 +1,1 @@
-"""Worlds of other libraries as ours, and ours as theirs. Each file imports its library alone."""
+"""Environments of other libraries as ours, and ours as theirs; each file imports its own alone."""

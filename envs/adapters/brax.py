@@ -1,4 +1,4 @@
-"""Brax environments as our worlds, and our worlds as brax environments. Imports brax, lazily.
+"""Brax environments as ours, and ours as brax environments. Imports brax, lazily.
 
 brax's own training loops start every later episode of a lane from its first, cached start. Ours
 draw a new start each time, in both directions.
@@ -60,7 +60,7 @@ def _nothing(state: Any) -> jax.Array:
 
 
 class FromBrax(Environment):
-    """A brax environment as one of our worlds.
+    """A brax environment as one of our environments.
 
     brax knows no success, cost or time limit. By default nothing costs, and to last until time is
     up is to succeed (`Outcome.terminated` is brax's `done`).
@@ -154,7 +154,7 @@ def make_brax(name: str, **options: Any) -> FromBrax:
 
 
 def to_brax(env: Env, params: Any = None, auto_reset: bool = True) -> Any:
-    """One of our worlds as a `brax.envs.Env`.
+    """One of our environments as a `brax.envs.Env`.
 
     `metrics` has cost, success and progress. With `auto_reset` the state after an episode's end is
     a new start (`done` and `info["truncation"]` tell, `info["final_observation"]` keeps the last
@@ -162,7 +162,7 @@ def to_brax(env: Env, params: Any = None, auto_reset: bool = True) -> Any:
     which adds brax's time limit and its cached resets.
 
     Args:
-        env: The world.
+        env: The environment.
         params: Its parameters; its training ones where None.
         auto_reset: Start anew where an episode ends.
 

@@ -1,1 +1,1 @@
-"""A jitted driving world true to MetaDrive."""
+"""A jitted driving environment true to MetaDrive."""

@@ -73,7 +73,7 @@ class DrivingState:
 
 @flax.struct.dataclass
 class DrivingParams:
-    """Traced parameters of the world.
+    """Traced parameters of the environment.
 
     Attributes:
         scenarios: Pool with a leading [S] axis.
@@ -333,7 +333,7 @@ class Driving(Environment):
         self, key: jax.Array, state: DrivingState, action: jax.Array, params: DrivingParams
     ) -> tuple[DrivingState, Outcome]:
         """One control step of 0.1 s, without reset."""
-        del key  # the world is deterministic
+        del key  # the environment is deterministic
         scenario = tree_index(params.scenarios, state.scenario)
         lane = tree_index(scenario.lanes, state.navigation.lane)
         ego_long, _ = lane_coordinates(lane, state.ego.pose[:2])
@@ -472,13 +472,13 @@ def _starts(pool: Scenario) -> tuple[DrivingState, jax.Array]:
 def make_params(
     descriptions: Sequence[Description], capacity: Capacity | None = None
 ) -> DrivingParams:
-    """Pack scenarios into parameters of the world.
+    """Pack scenarios into parameters of the environment.
 
     Raises:
         ValueError: If there are none, or one does not fit `capacity`.
     """
     if not descriptions:
-        raise ValueError("a driving world needs at least one scenario")
+        raise ValueError("a driving environment needs at least one scenario")
     capacity = capacity or Capacity.of(descriptions)
     packed = stack([pack(description, capacity) for description in descriptions])
     pool = jax.tree.map(jnp.asarray, packed)

@@ -1,4 +1,4 @@
-"""How close this world is to recorded MetaDrive: `python -m envs.driving.fidelity DIR`.
+"""How close this environment is to recorded MetaDrive: `python -m envs.driving.fidelity DIR`.
 
 Prints one JSON object for a folder of recordings (`md_<number>.npz`, and `neural_expert.npz` for
 `expert_success`):
@@ -10,8 +10,8 @@ Prints one JSON object for a folder of recordings (`md_<number>.npz`, and `neura
 - `position_error_1s_median`, `position_error_1s_p95`: m, after replaying ten recorded actions from
   every recorded state; windows with a contact are left out;
 - `reward_agreement`: share of steps whose reward agrees within 0.05;
-- `expert_success`: of the recorded neural expert on the 50 held-out scenarios of this world (null
-  without its file).
+- `expert_success`: of the recorded neural expert on the 50 held-out scenarios of this environment
+  (null without its file).
 """
 
 from __future__ import annotations
@@ -278,14 +278,14 @@ def recorded_expert(path: str | Path):
     return policy
 
 
-def success_rate(policy, world: driving.Driving) -> float:
+def success_rate(policy, env: driving.Driving) -> float:
     """Success of a policy over every held-out scenario once."""
     from ppl_jax.evaluation import evaluate
 
     def act(key, state, observation, params):
         return policy(observation)
 
-    result = evaluate(world, act, world.held_out_params, jax.random.key(0))
+    result = evaluate(env, act, env.held_out_params, jax.random.key(0))
     return float(np.mean(result.success))
 
 

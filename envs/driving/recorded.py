@@ -1,4 +1,4 @@
-"""Recorded MetaDrive scenarios as scenarios of this world.
+"""Recorded MetaDrive scenarios as scenarios of this environment.
 
 A recording is one `md_<number>.npz` whose `meta` (a JSON string) lists every lane, the route, the
 ego's parameters, objects and traffic. Only `meta` is needed to drive on it.

@@ -1,4 +1,4 @@
-"""Top-down pictures of the driving world and films of an episode (needs the `render` extra).
+"""Top-down pictures of the driving environment and films of an episode (needs the `render` extra).
 
 Road grey, ego blue, traffic orange, wrecks and objects red; the predicted path is red when the
 expert would take over and green when not, the expert's own is blue.

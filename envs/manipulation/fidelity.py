@@ -1,4 +1,4 @@
-"""How close these worlds are to robosuite 1.4.1: `python -m envs.manipulation.fidelity DIR`.
+"""How close these environments are to robosuite 1.4.1: `python -m envs.manipulation.fidelity DIR`.
 
 Prints one JSON object for a folder of recordings (`wipe_*`, `nut_*`, `free_wipe_*`, `free_nut_*`,
 `osc_steps`, `press`, `lookahead`, each `.npz`); a figure whose files are missing is null:

@@ -8,7 +8,7 @@ _FOLDER = Path(__file__).parent
 
 
 def policy_path(name: str) -> Path:
-    """File of the neural expert of world `name`.
+    """File of the neural expert of environment `name`.
 
     Raises:
         ValueError: If none is shipped.

@@ -126,7 +126,7 @@ def policy_path(run: Path) -> Path:
 
 
 def run_options(run: Path) -> tuple[str, dict[str, Any]]:
-    """The world of a run folder (or of a policy file's meta) and how it was built."""
+    """The environment of a run folder (or of a policy file's meta) and how it was built."""
     if run.is_file():
         try:
             meta = load_meta(run)
@@ -144,13 +144,13 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
 
 
 def run_spec(run: Path) -> EnvSpec:
-    """Sizes of a run's world."""
+    """Sizes of a run's environment."""
     env, _ = run_options(run)
-    return make_world(env, {}).spec
+    return make_env(env, {}).spec
 
 
-def make_world(name: str, options: dict[str, Any]) -> Env:
-    """Build a world; a mistake becomes a `UserError`."""
+def make_env(name: str, options: dict[str, Any]) -> Env:
+    """Build an environment; a mistake becomes a `UserError`."""
     try:
         return make(name, **options)
     except ValueError as error:
@@ -187,7 +187,7 @@ def named_policy(name: str, env: Env) -> SavedPolicy:
 
 
 def read_policy(path: str | Path, spec: EnvSpec) -> SavedPolicy:
-    """Load a policy file for a world; a mistake becomes a `UserError`."""
+    """Load a policy file for an environment; a mistake becomes a `UserError`."""
     try:
         return load_policy(path, spec.observation_size, spec.action_size)
     except ValueError as error:
@@ -204,5 +204,5 @@ def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
     name, options = run_options(run)
     if scenarios is not None:
         options = {"held_out_scenarios": scenarios}
-    env = make_world(name, options)
+    env = make_env(name, options)
     return evaluate_policy(env, read_policy(source, env.spec), 0)

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.engine.evaluate import (
     EvaluationRow,
     evaluate_policy,
-    make_world,
+    make_env,
     named_policy,
     read_evaluation,
     rows_of,
@@ -40,8 +40,8 @@ from ppl_jax.ppo.loop import PPOFunctions, PPOLearner, make_ppo_lagrangian
 from ppl_jax.types import Env
 
 
-def build_world(settings: ExpertSettings) -> Env:
-    """The world that an expert trains in.
+def build_env(settings: ExpertSettings) -> Env:
+    """The environment that an expert trains in.
 
     Raises:
         UserError: If a scenario folder cannot be used.
@@ -50,7 +50,7 @@ def build_world(settings: ExpertSettings) -> Env:
     options = {name: v for name in names if (v := getattr(settings, name)) is not None}
     if settings.training_scenarios:
         options["training"] = range(FIRST_SCENARIO, FIRST_SCENARIO + settings.training_scenarios)
-    return make_world(settings.env, options)
+    return make_env(settings.env, options)
 
 
 def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     check(settings)
     began = time.perf_counter()
     config, folder = settings.config, RunFolder(out)
-    env = build_world(settings)
+    env = build_env(settings)
     try:
         teacher = env.experts.get(env.card.expert.teacher)
         functions = make_ppo_lagrangian(env, config, expert=teacher)
@@ -226,7 +226,7 @@ def evaluate_expert(env: Env, kind: str) -> list[EvaluationRow]:
     """Play every held-out scenario once with an expert.
 
     Args:
-        env: The world.
+        env: The environment.
         kind: "scripted", "neural", a policy file or a run folder.
 
     Raises:

@@ -40,11 +40,11 @@ def save_policy(path: str | Path, policy: SavedPolicy, meta: dict[str, Any]) -> 
 
 
 def load_policy(path: str | Path, observation_size: int, action_size: int) -> SavedPolicy:
-    """Read a policy file and check it against a world.
+    """Read a policy file and check it against an environment.
 
     Raises:
         ValueError: If the file is missing, no policy or of a newer version, a number in it is not
-            finite, its layers do not fit together, or its sizes are not the world's.
+            finite, its layers do not fit together, or its sizes are not the environment's.
     """
     name = f"policy file {str(path)!r}"
     try:
@@ -77,7 +77,7 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     takes, gives = weights[0][0].shape[0], weights[-1][0].shape[1]
     if takes != observation_size or gives != action_size:
         raise ValueError(
-            f"{name} maps {takes} observations to {gives} actions; this world has "
+            f"{name} maps {takes} observations to {gives} actions; this environment has "
             f"{observation_size} and {action_size}"
         )
     arrays = {

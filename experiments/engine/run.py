@@ -18,7 +18,7 @@ import numpy as np
 from experiments.engine.evaluate import (
     arrays_of,
     evaluate_policy,
-    make_world,
+    make_env,
     named_expert,
     read_evaluation,
     read_policy,
@@ -45,17 +45,17 @@ from ppl_jax.types import Env, Expert
 
 
 def make_env_and_expert(settings: RunSettings) -> tuple[Env, Expert]:
-    """The world and the expert of a run.
+    """The environment and the expert of a run.
 
     Raises:
         UserError: If a scenario folder or the expert's file cannot be used.
     """
-    env = build_world(settings)
+    env = build_env(settings)
     return env, named_expert(settings.expert, env)
 
 
-def build_world(settings: RunSettings) -> Env:
-    """The world of a run.
+def build_env(settings: RunSettings) -> Env:
+    """The environment of a run.
 
     Raises:
         UserError: If a scenario folder cannot be used.
@@ -65,7 +65,7 @@ def build_world(settings: RunSettings) -> Env:
         for name in ("scenarios", "held_out_scenarios")
         if (value := getattr(settings, name)) is not None
     }
-    return make_world(settings.env, options)
+    return make_env(settings.env, options)
 
 
 def algorithm_factory(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
@@ -84,7 +84,7 @@ def algorithm_factory(settings: RunSettings, env: Env) -> algorithms.MakeAlgorit
 
 
 def saved_policy(env: Env, layers: Layers) -> SavedPolicy:
-    """A trained policy as plain arrays on the world's raw observation."""
+    """A trained policy as plain arrays on the environment's raw observation."""
     weights = [(np.asarray(w), np.asarray(b)) for w, b in layers]
     return SavedPolicy(
         weights, "relu", "tanh", env.spec.observation_mean, env.spec.observation_scale
@@ -142,7 +142,7 @@ def _functions(settings: RunSettings) -> tuple[Env, TrainFunctions]:
     if recording is None:
         env, expert = make_env_and_expert(settings)
         return env, make_train(env, expert, algorithm_factory(settings, env), settings.config)
-    env = build_world(settings)
+    env = build_env(settings)
     return env, recorded_functions(
         env, algorithm_factory(settings, env), settings.config, recording
     )

@@ -94,7 +94,7 @@ class _Process:
         return {"error": f"its worker died (exit status {code}); see {self.log}"}
 
     def _start(self) -> subprocess.Popen[str]:
-        # the program that was called: it may have registered methods or worlds of its own
+        # the program that was called: it may have registered methods or environments of its own
         words = [sys.executable, sys.argv[0], SERVE]
         with open(self.log, "a") as log:
             self.process = subprocess.Popen(
@@ -157,7 +157,7 @@ def _task(job: Job, program: str) -> Reply:
     """A job in a Ray worker, which keeps its programs and its core for the next one.
 
     The program that was called is run first, without its main part, where it is a script: it may
-    register methods or worlds of its own.
+    register methods or environments of its own.
     """
     global _worker
     import runpy

@@ -72,7 +72,7 @@ class Worker:
         return {"compile_s": compile_s, "seconds": seconds, "runs": runs}
 
     def _program(self, job: Job, traced: Any) -> tuple[Any, Any, float]:
-        """The compiled batch of these settings, its world, and the seconds that took just now."""
+        """The compiled batch of these settings, its environment, and the seconds that took."""
         import jax
 
         from experiments.engine.run import algorithm_factory, make_env_and_expert

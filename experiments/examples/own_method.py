@@ -38,7 +38,7 @@ class FocusedHParams:
 
 
 def make_focused(spec, config):
-    """`spec` holds the sizes of the world, `config` the static settings."""
+    """`spec` holds the sizes of the environment, `config` the static settings."""
     policy = make_policy(spec, config.hidden)
 
     def init(key):

@@ -28,7 +28,7 @@ class Compare:
     """Train all methods with the same seeds; one table."""
 
     env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
+    """Environment; `ppl list` names them."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: all)."""
     seeds: Seeds = tuple(range(5))
@@ -38,11 +38,11 @@ class Compare:
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
     gate: str | None = None
-    """Rule by which the expert takes over (default: the paper's rule for the world)."""
+    """Rule by which the expert takes over (default: the paper's rule for the environment)."""
     min_return: float | None = None
     """Gate low_return: predicted return at or below which the expert takes over."""
     max_departure: float | None = None
-    """Gate deviates_from_expert: how far from the expert's own path, in the world's units."""
+    """Gate deviates_from_expert: how far from the expert's own path, in the environment's units."""
     min_log_density: float | None = None
     """Gate action_probability: log-density under a neural expert below which it takes over."""
     batch_size: int | None = None
@@ -66,7 +66,7 @@ class Ablation:
     """Train the ten rows of the paper's ablation with the same seeds; one table."""
 
     env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
+    """Environment; `ppl list` names them."""
     seeds: Seeds = tuple(range(5))
     """How many (5), which (3 7 11) or a range (10-19); each row the same."""
     total_steps: int | None = None
@@ -92,7 +92,7 @@ class Tune:
     """Try the declared grid of every method, on training scenarios; one table."""
 
     env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
+    """Environment; `ppl list` names them."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: all)."""
     seeds: Seeds = tuple(range(2))
@@ -125,7 +125,7 @@ class ExpertEvaluate:
     """Play every held-out scenario once with an expert."""
 
     env: Positional[str]
-    """World: driving, table_wiping, nut_assembly, or brax:NAME."""
+    """Environment (`ppl list` names them), or brax:NAME."""
     kind: str = "neural"
     """neural (the shipped one), scripted, or a policy file or run folder."""
     scenarios: str | None = None
@@ -154,7 +154,7 @@ class Sweep:
     """
 
     envs: Positional[tuple[str, ...]]
-    """Worlds: driving, table_wiping, nut_assembly."""
+    """Environments; `ppl list` names them."""
     study: str | None = None
     """A grid of the paper's: L, L x beta, noise of predicted states or of the expert, predictors.
     Values given replace the study's."""
@@ -227,7 +227,7 @@ class Horizon:
     """Measure along runs of ppl what a longer preference horizon buys and costs."""
 
     env: Positional[str]
-    """World: driving, table_wiping or nut_assembly."""
+    """Environment; `ppl list` names them."""
     seeds: Seeds = tuple(range(3))
     """How many (5), which (3 7 11) or a range (10-19); one run each."""
     total_steps: int | None = None
@@ -258,7 +258,7 @@ class Table:
     paper: bool = False
     """Show the paper's own figures beside ours."""
     env: str | None = None
-    """World of results that do not name theirs (those of ppl compare)."""
+    """Environment of results that do not name theirs (those of ppl compare)."""
 
 
 @dataclasses.dataclass
@@ -308,7 +308,7 @@ class Render:
     steps: int = 600
     """Most steps to draw."""
     env: str = "driving"
-    """World of "scripted" and "neural": driving, table_wiping or nut_assembly."""
+    """Environment of "scripted" and "neural"."""
 
 
 @dataclasses.dataclass
@@ -390,8 +390,8 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
-    parts: tuple[Literal["worlds", "training", "experts", "methods", "seeds", "sweep"], ...] = (
-        "worlds",
+    parts: tuple[Literal["envs", "training", "experts", "methods", "seeds", "sweep"], ...] = (
+        "envs",
         "training",
         "experts",
         "methods",

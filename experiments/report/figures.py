@@ -238,7 +238,7 @@ def over_axis(
 
 
 def _axis_panel(axes: Any, points: Sequence[Point], name: str, column: str) -> None:
-    """One world: a column over a setting."""
+    """One environment: a column over a setting."""
     values = list(dict.fromkeys(point.values[name] for point in points))
     if all(_is_number(point, name) for point in points):
         values.sort(key=float)
@@ -264,7 +264,7 @@ def _axis_panel(axes: Any, points: Sequence[Point], name: str, column: str) -> N
 
 
 def heatmap(points: Sequence[Point], names: Sequence[str], out: Path, column: str) -> None:
-    """A column over the values of two settings, one panel per world and method; figures inside.
+    """A column over two settings, one panel per environment and method; figures inside.
 
     Colours of a share run from 0 to 1, those of another column over the values shown.
     """
@@ -296,7 +296,7 @@ def _heat_panel(
     *,
     scale: tuple[float, float],
 ) -> Any:
-    """One world and method; returns the image, for the colour bar."""
+    """One environment and method; returns the image, for the colour bar."""
     across, down = (list(dict.fromkeys(p.values[name] for p in points)) for name in names)
     grid = np.full((len(down), len(across)), np.nan)
     over = common_over(points)
@@ -347,7 +347,7 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
 
     Args:
         measured: A file of `ppl horizon`.
-        results: Results over L of the same world, or none.
+        results: Results over L of the same environment, or none.
         out: Picture to write.
 
     Raises:

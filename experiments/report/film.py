@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
-from experiments.engine.evaluate import make_world, named_expert, run_options
+from experiments.engine.evaluate import make_env, named_expert, run_options
 from experiments.engine.runtime import UserError, need
 from ppl_jax import algorithms
 from ppl_jax.gates import gate
@@ -26,7 +26,7 @@ Draw = Callable[[Any, np.ndarray, bool, np.ndarray, str], np.ndarray]
 """`draw(state, novice's path, takeover, expert's path, caption) -> picture`."""
 
 
-def render(run: str, number: int, out: Path, steps: int, *, world: str = "driving") -> None:
+def render(run: str, number: int, out: Path, steps: int, *, env_name: str = "driving") -> None:
     """Play a held-out scenario and write the film.
 
     Args:
@@ -34,7 +34,7 @@ def render(run: str, number: int, out: Path, steps: int, *, world: str = "drivin
         number: Number of the scenario.
         out: .gif, .mp4 or .png (the last picture).
         steps: Most steps to draw.
-        world: Where `run` is "scripted" or "neural".
+        env_name: Environment, where `run` is "scripted" or "neural".
 
     Raises:
         UserError: If one of them cannot be used.
@@ -47,8 +47,8 @@ def render(run: str, number: int, out: Path, steps: int, *, world: str = "drivin
     if out.suffix == ".mp4":
         need("av", "render", "ppl render to .mp4")
     named = run in ("scripted", "neural")
-    name, options = (world, {}) if named else run_options(Path(run))
-    env = make_world(name, options)
+    name, options = (env_name, {}) if named else run_options(Path(run))
+    env = make_env(name, options)
     save_frames(out, episode(env, named_expert(run, env), number, steps))
 
 
@@ -56,7 +56,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
     """Pictures of an episode, one per control step.
 
     Raises:
-        UserError: If the world has no scenario of that number, or cannot be drawn here.
+        UserError: If the environment has no scenario of that number, or cannot be drawn here.
     """
     params = env.held_out_params
     numbers = np.asarray(env.scenario_numbers(params)).tolist()

@@ -46,8 +46,8 @@ class Point:
     """Runs with the same settings at one step.
 
     Attributes:
-        env, algorithm, step: World, method and environment steps.
-        values: Settings that differ between runs of the same world and method.
+        env, algorithm, step: Environment, method and environment steps.
+        values: Settings that differ between runs of the same environment and method.
         seeds: Seeds of the runs, sorted.
         measured: Column -> [seeds] values; columns that the file lacks are missing.
         episodes: Column -> [seeds, scenarios], where there is a row per scenario; else empty.
@@ -382,7 +382,7 @@ def reference_point(points: Sequence[Point], env: str, against: str | None = Non
 
 
 def _defaults(algorithm: str, env: str) -> dict[str, str]:
-    """A method's default settings in a world, as text; empty where either is unknown here."""
+    """A method's default settings in an environment, as text; empty where either is unknown."""
     try:
         found = default_settings(algorithm, env)
     except ValueError:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.driving.scenario import tree_index
-from experiments.engine.evaluate import arrays_of, make_world, policy_path, read_policy, run_options
+from experiments.engine.evaluate import arrays_of, make_env, policy_path, read_policy, run_options
 from experiments.engine.policy_file import load_meta
 from experiments.engine.runtime import UserError, need
 from ppl_jax import experts
@@ -26,7 +26,7 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
     """Play one held-out map with each policy and draw path, steering and speed.
 
     Args:
-        paths: Run folders or policy files of the driving world.
+        paths: Run folders or policy files of the driving environment.
         number: Number of the scenario.
         out: Picture to write.
 
@@ -34,11 +34,11 @@ def steering(paths: Sequence[Path], number: int, out: Path) -> None:
         UserError: If a path has no driving policy or there is no such scenario.
     """
     need("matplotlib", "plot", "a figure").use("Agg")
-    worlds = [run_options(path) for path in paths]
-    for path, (name, _) in zip(paths, worlds, strict=True):
+    options = [run_options(path) for path in paths]
+    for path, (name, _) in zip(paths, options, strict=True):
         if name != "driving":
             raise UserError(f"kind steering is for driving, {str(path)!r} is of {name}")
-    env = make_world("driving", worlds[0][1])
+    env = make_env("driving", options[0][1])
     numbers = np.asarray(env.scenario_numbers(env.held_out_params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")

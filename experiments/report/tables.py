@@ -184,7 +184,7 @@ def print_points(
     against: str | None = None,
     reported: Mapping[str, Reported] | None = None,
 ) -> None:
-    """Rows of one world, then each against the reference row.
+    """Rows of one environment, then each against the reference row.
 
     Raises:
         UserError: If `against` names no row.
@@ -222,7 +222,7 @@ def table(
         format: "text", "markdown" or "latex".
         against: Label of the reference row.
         paper: Whether to show the paper's own figures beside ours.
-        env: World of results that do not name theirs.
+        env: Environment of results that do not name theirs.
 
     Raises:
         UserError: If the file, the step or the row is not there.
@@ -237,15 +237,15 @@ def table(
         raise UserError(f"{str(results)!r}: no run finished, every one failed or diverged")
     for name in dict.fromkeys(point.env for point in points):
         mine = [point for point in points if point.env == name]
-        world = name or env or ""
-        if world:
-            print(f"\n{world}\n")
+        shown = name or env or ""
+        if shown:
+            print(f"\n{shown}\n")
         print_points(
             mine,
-            env=world,
+            env=shown,
             format=format,
             against=against,
-            reported=_reported(world) if paper else None,
+            reported=_reported(shown) if paper else None,
         )
 
 

@@ -22,7 +22,7 @@ class Study:
         title: Its question, in words.
         algorithms: Methods, where none are asked for.
         axes: Values of each setting.
-        total_steps: Factor on the world's own length, and the evaluations within it.
+        total_steps: Factor on the environment's own length, and the evaluations within it.
         evaluations: Over the whole run.
     """
 
@@ -36,7 +36,7 @@ class Study:
 NOISES = (0.0, 0.0625, 0.125, 0.25, 0.5, 1.0)
 HORIZONS = (1, 2, 4, 6, 8, 10)
 
-# H and the other settings are the paper's own; L beyond a world's H is left out
+# H and the other settings are the paper's own; L beyond an environment's H is left out
 STUDIES = {
     "horizon": Study(
         "the effect of L (Fig. 8), at the paper's length and half as far again",

@@ -50,14 +50,14 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
 
     Args:
         repeats: Repeats of each figure; medians are reported.
-        parts: Some of "worlds", "training", "experts", "methods", "seeds" (methods, and five seeds
+        parts: Some of "envs", "training", "experts", "methods", "seeds" (methods, and five seeds
             in one program), "sweep".
         out: JSON file to write, or None.
     """
     began = time.perf_counter()
     env = make_driving()
     figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
-    if "worlds" in parts:
+    if "envs" in parts:
         figures |= _environment(env, repeats) | _lookahead(env, repeats)
         for name in ("table_wiping", "nut_assembly"):
             figures |= _arm(name, repeats)
@@ -85,39 +85,37 @@ def _environment(env: Any, repeats: int) -> dict[str, float]:
     """Environment steps per second with the full observation and automatic reset."""
     params, figures = env.default_params, {}
     action = jnp.array([0.0, 0.4])
-    for worlds in (1, 64, 1024):
-        length = max(STEPS * 4 // worlds, 20)
+    for count in (1, 64, 1024):
+        length = max(STEPS * 4 // count, 20)
 
-        def run(states: Any, key: jax.Array, worlds: int = worlds, length: int = length) -> Any:
+        def run(states: Any, key: jax.Array, count: int = count, length: int = length) -> Any:
             def one(key: jax.Array, state: Any) -> Any:
                 obs, state, reward, *_ = env.step(key, state, action, params)
                 return state, obs[0] + obs[-1] + reward
 
             def step(carry: Any, key: jax.Array) -> Any:
                 states, total = carry
-                if worlds == 1:
+                if count == 1:
                     states, seen = one(key, states)
                 else:
-                    states, seen = jax.vmap(one)(jax.random.split(key, worlds), states)
+                    states, seen = jax.vmap(one)(jax.random.split(key, count), states)
                 return (states, total + jnp.sum(seen)), None
 
             return jax.lax.scan(step, (states, 0.0), jax.random.split(key, length))[0]
 
         key = jax.random.key(0)
-        if worlds == 1:
+        if count == 1:
             _, states = env.reset(key, params)
         else:
-            _, states = jax.vmap(env.reset, in_axes=(0, None))(
-                jax.random.split(key, worlds), params
-            )
+            _, states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, count), params)
         program = jax.jit(run)
         seconds = _median_s(lambda p=program, s=states, k=key: p(s, k), repeats)
-        figures[f"env_steps_per_s_{worlds}"] = worlds * length / seconds
+        figures[f"env_steps_per_s_{count}"] = count * length / seconds
     return figures
 
 
 def _lookahead(env: Any, repeats: int) -> dict[str, float]:
-    """Predicted steps per second of the gate's lookahead in one world (no observations)."""
+    """Predicted steps per second of the gate's lookahead in one environment (no observations)."""
     params, horizon, calls = env.default_params, 10, 100
     _, state = env.reset(jax.random.key(0), params)
 
@@ -142,7 +140,7 @@ def _lookahead(env: Any, repeats: int) -> dict[str, float]:
 
 
 def _arm(name: str, repeats: int) -> dict[str, float]:
-    """Control steps per second of an arm world, its lookahead, compile time, and C MuJoCo's rate.
+    """Control steps per second of an arm, its lookahead, compile time, and C MuJoCo's rate.
 
     The expert is at the controls until the tool is in contact; its last action is held from there.
     """
@@ -165,15 +163,15 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
 
     start = env.reset_to(jnp.int32(0), key, params)
     state, actions = jax.jit(approach)(start)
-    for worlds in (1, 16, 64, 256):
-        many = jax.tree.map(lambda x, n=worlds: jnp.stack([x] * n), state)
+    for count in (1, 16, 64, 256):
+        many = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), state)
         began = time.perf_counter()
-        given = state if worlds == 1 else many
-        program = jax.jit(play if worlds == 1 else jax.vmap(play, in_axes=(0, None)))
+        given = state if count == 1 else many
+        program = jax.jit(play if count == 1 else jax.vmap(play, in_axes=(0, None)))
         compiled = program.lower(given, actions[-1]).compile()
-        figures[f"{name}_compile_s_{worlds}"] = time.perf_counter() - began
+        figures[f"{name}_compile_s_{count}"] = time.perf_counter() - began
         seconds = _median_s(lambda c=compiled, g=given: c(g, actions[-1]), repeats)
-        figures[f"{name}_steps_per_s_{worlds}"] = worlds * steps / seconds
+        figures[f"{name}_steps_per_s_{count}"] = count * steps / seconds
     ahead = jax.jit(
         lambda state: (
             predict(
@@ -390,7 +388,7 @@ def _sweep(repeats: int) -> dict[str, float]:
     """Wall time per run of a sweep of short runs, against runs of `ppl train` one by one.
 
     Both from the command line, with the programs' caches as they are: Python's start, building the
-    world, compiling (or reading the cache) and evaluations are in both.
+    environment, compiling (or reading the cache) and evaluations are in both.
     """
     program = [sys.executable, "-m", "experiments.cli"]
 

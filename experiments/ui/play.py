@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.engine.run import build_world, open_folder
+from experiments.engine.run import build_env, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
 from experiments.engine.settings import RunSettings, check, one_level
@@ -45,7 +45,7 @@ def play(
     from experiments.ui.trainer import InteractiveTrainer
 
     with server.listen(host, port, exposed) as served:
-        env = build_world(settings)
+        env = build_env(settings)
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)
         try:

@@ -24,8 +24,8 @@ from ppl_jax.ppo.rollout import (
     Problem,
     query_expert,
     scaled,
-    start_worlds,
-    step_worlds,
+    start_envs,
+    step_envs,
 )
 
 CLONING_RATE = 1e-3  # Adam, falling to 0
@@ -59,7 +59,7 @@ def show(at: Round, learner: PPOLearner, _: None) -> Any:
     action = jnp.where(at.number == 0, shown, own)
     noise = learner.hparams.demonstration_noise * jax.random.normal(key_noise, action.shape)
     learner = dataclasses.replace(learner, key=key)
-    learner, row = step_worlds(problem, key_step, learner, action + noise)
+    learner, row = step_envs(problem, key_step, learner, action + noise)
     apart = jnp.sum(jnp.abs(jnp.clip(own, -1.0, 1.0) - shown), -1)
     return learner, (apart, observation, shown, row[3].success, row[2])
 
@@ -126,7 +126,7 @@ def clone(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Metrics]:
     learner, cloned, inputs, _ = carry
     start = init_learned(cloned.average)  # PPO's Adam starts anew
     learned = dataclasses.replace(learner.learned, policy=start, inputs=inputs)
-    learner = dataclasses.replace(learner, learned=learned, **start_worlds(problem, learner.key))
+    learner = dataclasses.replace(learner, learned=learned, **start_envs(problem, learner.key))
     return learner, {
         "clone/loss": metrics["loss"][-1],
         "clone/success_rate": metrics["success_rate"][0],

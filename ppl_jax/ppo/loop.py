@@ -64,7 +64,7 @@ from ppl_jax.ppo.rollout import (
     make_problem,
     rollout,
     scaled,
-    start_worlds,
+    start_envs,
     value_unit,
     values,
 )
@@ -139,7 +139,7 @@ def init(problem: Problem, key: jax.Array, hparams: PPOHParams) -> PPOLearner:
             inputs=init_running_stats((problem.env.spec.observation_size,)),
             returns=init_running_stats((2,)),
         ),
-        **start_worlds(problem, key_env),
+        **start_envs(problem, key_env),
         key=key,
         hparams=hparams,
         batches=jnp.zeros((), jnp.int32),

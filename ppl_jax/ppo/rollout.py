@@ -93,7 +93,7 @@ class PPOLearned:
 
 @flax.struct.dataclass
 class Played:
-    """Sums over the running episode of each world, [W]."""
+    """Sums over the running episode of each environment, [W]."""
 
     reward: jax.Array
     cost: jax.Array
@@ -106,7 +106,7 @@ class PPOLearner:
 
     Attributes:
         learned: `PPOLearned`.
-        env_state: [W] worlds.
+        env_state: [W] environments.
         observation: [W, O] of them.
         played: `Played`.
         key: Random key.
@@ -141,7 +141,7 @@ class Rollout:
     ended: Played  # of the episode, up to and with this step
 
 
-def start_worlds(problem: Problem, key: jax.Array) -> dict[str, Any]:
+def start_envs(problem: Problem, key: jax.Array) -> dict[str, Any]:
     """Fresh environments with their observations and empty episode sums."""
     keys, zero = jax.random.split(key, problem.config.num_envs), jnp.zeros(problem.config.num_envs)
     observation, env_state = jax.vmap(problem.env.reset, in_axes=(0, None))(keys, problem.params)
@@ -168,8 +168,8 @@ def scaled(problem: Problem, inputs: RunningStats, observation: jax.Array) -> ja
     return (observation - mean) / scale
 
 
-def step_worlds(problem: Problem, key: jax.Array, learner: PPOLearner, action: jax.Array) -> Any:
-    """One step of every world with clipped actions; (learner, rollout row less observation)."""
+def step_envs(problem: Problem, key: jax.Array, learner: PPOLearner, action: jax.Array) -> Any:
+    """One step of every environment, clipped actions; (learner, rollout row less observation)."""
     observation, env_state, reward, terminated, truncated, info = jax.vmap(
         problem.env.step, in_axes=(0, 0, 0, None)
     )(
@@ -196,7 +196,7 @@ def step_worlds(problem: Problem, key: jax.Array, learner: PPOLearner, action: j
 def query_expert(
     problem: Problem, key: jax.Array, env_state: PyTree, observation: jax.Array
 ) -> jax.Array:
-    """The expert's action in every world, [W, A]."""
+    """The expert's action in every environment, [W, A]."""
     assert problem.expert is not None  # see `make_ppo_lagrangian`
     keys = jax.random.split(key, problem.config.num_envs)
     return jax.vmap(problem.expert, in_axes=(0, 0, 0, None))(
@@ -214,7 +214,7 @@ def rollout(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Rollout]
         mean = problem.policy.apply(network["mean"], scaled(problem, inputs, observation))
         noise = jax.random.normal(key_act, mean.shape)
         action = mean + jnp.exp(network["log_std"]) * noise
-        learner, row = step_worlds(problem, key_step, dataclasses.replace(learner, key=key), action)
+        learner, row = step_envs(problem, key_step, dataclasses.replace(learner, key=key), action)
         reward, terminated, done, info, played = row
         guided = problem.config.guided
         return learner, Rollout(

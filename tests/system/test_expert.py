@@ -13,7 +13,7 @@ import envs
 from envs import pretrained
 from experiments.cli import main, parse
 from experiments.engine import expert, expert_settings
-from experiments.engine.evaluate import make_world, named_expert, named_policy, summarise_episodes
+from experiments.engine.evaluate import make_env, named_expert, named_policy, summarise_episodes
 from experiments.engine.expert_settings import ExpertSettings, read_settings, settings_for
 from experiments.engine.policy_file import load_policy, save_policy
 from experiments.engine.run import record_of
@@ -189,7 +189,7 @@ def test_a_run_of_an_earlier_version_is_read_and_continued(run, tmp_path, monkey
     names = of_schema_1(run, out)
     assert read_settings(RunFolder(out)) == read_settings(RunFolder(run))
     shutil.rmtree(out / "checkpoints" / "step_1024")
-    env, settings = make_world("probe", {}), read_settings(RunFolder(out))
+    env, settings = make_env("probe", {}), read_settings(RunFolder(out))
     functions = make_ppo_lagrangian(env, settings.config, expert=env.experts["scripted"])
     like = jax.jit(functions.init)(jax.random.key(0), settings.hparams)
     found = checkpoint.restore(out / "checkpoints", like, print)
@@ -403,7 +403,7 @@ def test_a_shipped_expert_is_small_and_has_its_card(name):
     ],
 )
 def test_a_shipped_expert_does_what_its_card_says(name, least, cost):
-    env = make_world(name, {})
+    env = make_env(name, {})
     scores = summarise_episodes(expert.evaluate_expert(env, "neural"))
     told = json.loads(pretrained.policy_path(name).with_suffix(".json").read_text())["held_out"]
     assert scores["success_rate"] == pytest.approx(told["success_rate"], abs=0.021)  # one episode

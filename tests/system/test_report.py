@@ -312,7 +312,7 @@ def test_unknown_columns_and_kinds_are_refused(tmp_path):
         ),
         (
             "mujoco",
-            lambda path: film.render("scripted", 1000, path / "x.gif", 1, world="table_wiping"),
+            lambda path: film.render("scripted", 1000, path / "x.gif", 1, env_name="table_wiping"),
             r"needs mujoco: pip install 'ppl-jax\[manipulation\]'",
         ),
     ],
