@@ -94,7 +94,7 @@ class Environment:
         state, outcome = self.transition(key_step, state, action, params)
         final = self.observe(state, params)
         observation, state = self.auto_reset(
-            key_reset, outcome.terminated | outcome.truncated, state, final, params
+            key_reset, outcome.terminated | outcome.truncated, state, final, params=params
         )
         info = StepInfo(
             cost=outcome.cost,
@@ -107,7 +107,7 @@ class Environment:
         return observation, state, outcome.reward, outcome.terminated, outcome.truncated, info
 
     def auto_reset(
-        self, key: jax.Array, done: jax.Array, state: Any, observation: jax.Array, params: Any
+        self, key: jax.Array, done: jax.Array, state: Any, observation: jax.Array, *, params: Any
     ) -> tuple[jax.Array, Any]:
         """(observation, state) to continue from: a new random start where `done`."""
 

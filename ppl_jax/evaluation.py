@@ -47,7 +47,13 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
             jnp.arange(count), jax.random.split(key_reset, count), params
         )
         zero = jnp.zeros(count)
-        start = Episodes(jnp.zeros(count, bool), zero, zero, zero, jnp.zeros(count, jnp.int32))
+        start = Episodes(
+            success=jnp.zeros(count, bool),
+            episodic_return=zero,
+            episodic_cost=zero,
+            progress=zero,
+            length=jnp.zeros(count, jnp.int32),
+        )
 
         def one(key: jax.Array, state: Any) -> Any:
             key_act, key_step = jax.random.split(key)
@@ -70,11 +76,11 @@ def make_evaluate(env: Env, act: Act) -> Callable[[Any, jax.Array], Episodes]:
             else:
                 states, out = jax.vmap(one)(keys, states)
             so_far = Episodes(
-                so_far.success | (alive & out.success),
-                so_far.episodic_return + alive * out.reward,
-                so_far.episodic_cost + alive * out.cost,
-                jnp.where(alive, out.progress, so_far.progress),
-                so_far.length + alive,
+                success=so_far.success | (alive & out.success),
+                episodic_return=so_far.episodic_return + alive * out.reward,
+                episodic_cost=so_far.episodic_cost + alive * out.cost,
+                progress=jnp.where(alive, out.progress, so_far.progress),
+                length=so_far.length + alive,
             )
             alive = alive & ~(out.terminated | out.truncated)
             return key, states, alive, so_far, time + 1

@@ -55,7 +55,14 @@ def setting(
         group: Group on the command line.
         common: Whether `--help` shows it.
     """
-    about = About(help, low, high, None if choices is None else tuple(choices), group, common)
+    about = About(
+        help=help,
+        low=low,
+        high=high,
+        choices=None if choices is None else tuple(choices),
+        group=group,
+        common=common,
+    )
     return dataclasses.field(default=default, metadata={KEY: about})
 
 

@@ -174,7 +174,12 @@ def register_gate(
     if name in _GATES:
         raise ValueError(f"gate {name!r} is registered already")
     check_unique(hparams)
-    _GATES[name] = Gate(decide, hparams, needs_expert_rollout, needs_density)
+    _GATES[name] = Gate(
+        decide=decide,
+        hparams=hparams,
+        needs_expert_rollout=needs_expert_rollout,
+        needs_density=needs_density,
+    )
 
 
 register_gate("unsafe_or_slow", unsafe_or_slow, hparams=UnsafeOrSlowHParams)

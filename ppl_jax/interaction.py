@@ -1,14 +1,16 @@
 """One step of the loop: act, look ahead, store; one update. What decides who acts is elsewhere.
 
 `ppl_jax.training` scans these steps with a gate that decides; `ppl_jax.live` makes them one by one
-as a person decides.
+as a person decides. Every function takes the `Problem`, which is static, and the `Learner`, which
+is all that changes.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.struct
 import jax
@@ -18,7 +20,7 @@ from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.config import HParams, TrainConfig, as_arrays
 from ppl_jax.losses import Metrics
 from ppl_jax.predictors import add_noise, predict, predictor
-from ppl_jax.types import Env, Expert, Interaction, Trajectory
+from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory
 
 PyTree = Any
 KEYS = 6  # of a step
@@ -69,210 +71,262 @@ class Learner:
     diverged: jax.Array
 
 
-class Steps(NamedTuple):
-    """Functions that `make_steps` returns; all pure.
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Who learns what, where and from whom; static. `make_problem` builds it.
 
     Attributes:
-        init: `init(key, hparams) -> Learner`.
-        sample_novice_action: `sample_novice_action(learner, key, observation) -> action [A]` of the
-            novice, not yet clipped.
-        query_expert: `query_expert(learner, key, observation) -> action [A]` of the expert, with
-            its noise.
-        interact: `interact(learner, started, action=None) -> (Learner, Interaction)`: one step
-            of expert or novice (see `learner.takeover`); `action` is the expert's where given.
-            `started`: an expert in control was not in the step before.
-        ingest: `ingest(learner, interaction) -> Learner`: store a recorded step as if made now.
-        learn: `learn(learner, update) -> (Learner, Metrics)`: one update; where a loss is not
-            finite, what was learned stays as it was before.
+        env: The environment.
+        expert: Acts during takeovers; None where somebody outside does.
+        algorithm: The method.
+        config: Static settings.
+        params: The environment's parameters.
+        transition: `transition(key, state, action, params, hparams=...)` of the predictor.
     """
 
-    init: Callable[[jax.Array, HParams], Learner]
-    sample_novice_action: Callable[[Learner, jax.Array, jax.Array], jax.Array]
-    query_expert: Callable[[Learner, jax.Array, jax.Array], jax.Array]
-    interact: Callable[..., tuple[Learner, Interaction]]
-    ingest: Callable[[Learner, Interaction], Learner]
-    learn: Callable[..., tuple[Learner, Metrics]]
+    env: Env
+    expert: Expert | None
+    algorithm: Algorithm
+    config: TrainConfig
+    params: PyTree
+    transition: Callable[..., tuple[PyTree, Outcome]]
 
 
-def make_steps(
-    env: Env, expert: Expert | None, algorithm: Algorithm, config: TrainConfig, *, params: PyTree
-) -> Steps:
-    """Build them.
+def make_problem(
+    env: Env,
+    expert: Expert | None,
+    algorithm: Algorithm,
+    config: TrainConfig,
+    *,
+    params: PyTree | None = None,
+) -> Problem:
+    """Put a problem together.
 
     Args:
         env: The environment.
         expert: Acts during takeovers; None where somebody outside does.
         algorithm: The method.
         config: Static settings.
-        params: The environment's parameters.
+        params: The environment's parameters; its training ones where None.
 
     Raises:
         ValueError: If the environment lacks the predictor that `config` names.
     """
-    predicted_transition = predictor(config.predictor).make(env)
+    return Problem(
+        env=env,
+        expert=expert,
+        algorithm=algorithm,
+        config=config,
+        params=env.default_params if params is None else params,
+        transition=predictor(config.predictor).make(env),
+    )
 
-    def init(key: jax.Array, hparams: HParams) -> Learner:
-        key, key_algorithm, key_env = jax.random.split(key, 3)
-        _, env_state = env.reset(key_env, params)
-        zero = jnp.zeros((), jnp.int32)
-        return Learner(
-            algorithm=algorithm.init(key_algorithm),
-            env_state=env_state,
-            takeover=jnp.zeros((), bool),
-            key=key,
-            hparams=as_arrays(hparams),
-            counters=Counters(zero, zero, zero, zero, zero, jnp.zeros(()), zero),
-            diverged=jnp.zeros((), bool),
-        )
 
-    def sample_novice_action(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
-        key_act, key_guess = jax.random.split(key)
-        action = algorithm.act(learner.algorithm, key_act, observation)
-        if config.random_steps:
-            guess = jax.random.uniform(key_guess, action.shape, minval=-1.0, maxval=1.0)
-            action = jnp.where(learner.counters.steps < config.random_steps, guess, action)
-        return action
+def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
+    """A learner before its first step."""
+    key, key_algorithm, key_env = jax.random.split(key, 3)
+    _, env_state = problem.env.reset(key_env, problem.params)
+    zero = jnp.zeros((), jnp.int32)
+    return Learner(
+        algorithm=problem.algorithm.init(key_algorithm),
+        env_state=env_state,
+        takeover=jnp.zeros((), bool),
+        key=key,
+        hparams=as_arrays(hparams),
+        counters=Counters(
+            steps=zero,
+            human_data=zero,
+            takeovers=zero,
+            episodes=zero,
+            successes=zero,
+            cost=jnp.zeros(()),
+            physics_diverged=zero,
+        ),
+        diverged=jnp.zeros((), bool),
+    )
 
-    def query_expert(learner: Learner, key: jax.Array, observation: jax.Array) -> jax.Array:
-        """The expert's action, with its noise."""
-        assert expert is not None  # else the caller of `interact` says what it does
-        key_expert, key_noise = jax.random.split(key)
-        action = expert(key_expert, learner.env_state, observation, params)
-        noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
-        return jnp.clip(action + noise, -1.0, 1.0)
 
-    def ahead(
-        takeover: jax.Array,
-        key: jax.Array,
-        state: PyTree,
-        action: jax.Array,
-        params: PyTree,
-        hparams: PyTree,
-    ) -> Trajectory:
-        def transition(*args: Any) -> Any:
-            return predicted_transition(*args, hparams)
+def sample_novice_action(
+    problem: Problem, learner: Learner, key: jax.Array, observation: jax.Array
+) -> jax.Array:
+    """The novice's action [A], not yet clipped; a random one in the first `random_steps`."""
+    key_act, key_guess = jax.random.split(key)
+    action = problem.algorithm.act(learner.algorithm, key_act, observation)
+    random_steps = problem.config.random_steps
+    if random_steps:
+        guess = jax.random.uniform(key_guess, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(learner.counters.steps < random_steps, guess, action)
+    return action
 
-        def roll() -> Trajectory:
-            return predict(
-                env,
-                transition,
-                key,
-                state,
-                action=action,
-                params=params,
-                horizon=algorithm.predicted_steps,
-                observe=True,
-                labelling_expert=expert if algorithm.labels_predictions else None,
-            )
 
-        def nothing() -> Trajectory:
-            return jax.tree.map(
-                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(roll)
-            )
+def query_expert(
+    problem: Problem, learner: Learner, key: jax.Array, observation: jax.Array
+) -> jax.Array:
+    """The expert's action [A], with its noise."""
+    assert problem.expert is not None  # else the caller of `interact` says what it does
+    key_expert, key_noise = jax.random.split(key)
+    action = problem.expert(key_expert, learner.env_state, observation, problem.params)
+    noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
+    return jnp.clip(action + noise, -1.0, 1.0)
 
-        return jax.lax.cond(takeover, roll, nothing)
+
+def transition_of(problem: Problem, hparams: PyTree) -> Callable[..., tuple[PyTree, Outcome]]:
+    """The predictor's `transition(key, state, action, params)` under its traced settings."""
+    return functools.partial(problem.transition, hparams=hparams)
+
+
+def look_ahead(problem: Problem, learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
+    """The first predicted states, for the pairs; skipped while the novice is in control."""
+    key_predict, key_noise = jax.random.split(key)
+
+    def ahead(learner: Learner, key: jax.Array, action: jax.Array, params: PyTree) -> Trajectory:
+        return _if_expert(problem, learner, key, action=action, params=params)
 
     if jax.default_backend() == "cpu":
-        # a batched cond makes every lane pay for the lookahead; one lane after another, only those
-        # whose expert is in control do (a core is as fast with one lane as with many)
+        # a batched cond makes every run pay for the lookahead; one run after another, only those
+        # whose expert is in control do (a core is as fast with one run as with many)
         ahead = jax.custom_batching.sequential_vmap(ahead)
+    only = dataclasses.replace(learner, algorithm=None, counters=None)  # what it reads
+    trajectory = ahead(only, key_predict, action, problem.params)
+    noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
+    return dataclasses.replace(trajectory, observation=noisy)
 
-    def look_ahead(learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
-        """The first predicted states, for the pairs; skipped while the novice is in control."""
-        key_predict, key_noise = jax.random.split(key)
-        trajectory = ahead(
-            learner.takeover,
-            key_predict,
+
+def _if_expert(
+    problem: Problem, learner: Learner, key: jax.Array, *, action: jax.Array, params: PyTree
+) -> Trajectory:
+    """The prediction where the expert is in control, else zeros."""
+    algorithm = problem.algorithm
+
+    def roll() -> Trajectory:
+        return predict(
+            problem.env,
+            transition_of(problem, learner.hparams.predictor),
+            key,
             learner.env_state,
-            action,
-            params,
-            learner.hparams.predictor,
-        )
-        noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
-        return dataclasses.replace(trajectory, observation=noisy)
-
-    def store(
-        learner: Learner, step: Interaction, physics_diverged: jax.Array | bool = False
-    ) -> Learner:
-        counters, done = learner.counters, step.terminated | step.truncated
-        return dataclasses.replace(
-            learner,
-            algorithm=algorithm.store(learner.algorithm, step, learner.hparams),
-            counters=Counters(
-                steps=counters.steps + 1,
-                human_data=counters.human_data + step.takeover,
-                takeovers=counters.takeovers + step.takeover_start,
-                episodes=counters.episodes + done,
-                successes=counters.successes + step.success,
-                cost=counters.cost + step.cost,
-                physics_diverged=counters.physics_diverged + physics_diverged,
-            ),
+            action=action,
+            params=params,
+            horizon=algorithm.predicted_steps,
+            observe=True,
+            labelling_expert=problem.expert if algorithm.labels_predictions else None,
         )
 
-    def ingest(learner: Learner, step: Interaction) -> Learner:
-        key = jax.random.split(learner.key, KEYS)[0]  # as `interact` would leave it
-        return store(dataclasses.replace(learner, key=key), step)
+    def nothing() -> Trajectory:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(roll))
 
-    def interact(
-        learner: Learner, started: jax.Array, action: jax.Array | None = None
-    ) -> tuple[Learner, Interaction]:
-        """One environment step: act and store."""
-        keys = jax.random.split(learner.key, KEYS)
-        key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
-        state = learner.env_state
-        observation = env.observe(state, params)
-        novice_action = sample_novice_action(learner, key_propose, observation)
-        expert_action = query_expert(learner, key_expert, observation) if action is None else action
-        takeover = learner.takeover
-        executed = jnp.where(takeover, expert_action, jnp.clip(novice_action, -1.0, 1.0))
-        if algorithm.predicted_steps:
-            predicted = look_ahead(learner, key_ahead, novice_action)
-        else:
-            empty = jnp.zeros((0,))
-            predicted = Trajectory(empty[:, None], empty, empty, *([empty.astype(bool)] * 4))
-        after, outcome = env.transition(key_env, state, executed, params)
-        interaction = Interaction(
-            observation=observation,
-            next_observation=env.observe(after, params),
-            novice_action=novice_action,
-            expert_action=expert_action,
-            executed_action=executed,
-            takeover=takeover,
-            takeover_start=takeover & started,
-            reward=outcome.reward,
-            cost=outcome.cost,
-            terminated=outcome.terminated,
-            truncated=outcome.truncated,
-            success=outcome.success,
-            predicted=predicted,
-        )
-        done = outcome.terminated | outcome.truncated
-        restarted = jax.lax.cond(
-            done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset
-        )
-        learner = store(
-            dataclasses.replace(learner, key=key), interaction, outcome.physics_diverged
-        )
-        # a takeover ends with its episode; the gate next runs at a multiple of K
-        learner = dataclasses.replace(learner, env_state=restarted, takeover=takeover & ~done)
-        return learner, interaction
+    return jax.lax.cond(learner.takeover, roll, nothing)
 
-    def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
-        """One update; where a loss is not finite, what was learned stays as it was."""
-        key, key_update = jax.random.split(learner.key)
-        before = learner.algorithm
-        updated, metrics = update(before, key_update, learner.hparams)
-        finite = jnp.all(
-            jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)])
-        )
-        diverged = learner.diverged | ~finite
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(diverged, old, new), updated.learned, before.learned
-        )
-        updated = dataclasses.replace(updated, learned=kept)
-        return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
 
-    return Steps(init, sample_novice_action, query_expert, interact, ingest, learn)
+def no_prediction() -> Trajectory:
+    """A trajectory of no steps, of methods that make no pairs."""
+    empty = jnp.zeros((0,))
+    no = empty.astype(bool)
+    return Trajectory(
+        observation=empty[:, None],
+        reward=empty,
+        speed=empty,
+        unsafe=no,
+        success=no,
+        terminated=no,
+        valid=no,
+    )
+
+
+def interact(
+    problem: Problem, learner: Learner, started: jax.Array, action: jax.Array | None = None
+) -> tuple[Learner, Interaction]:
+    """One environment step of expert or novice (see `learner.takeover`): act and store.
+
+    Args:
+        problem: See `Problem`.
+        learner: Before the step.
+        started: An expert in control was not in the step before.
+        action: The expert's [A], where somebody outside says it.
+    """
+    env, params, state = problem.env, problem.params, learner.env_state
+    keys = jax.random.split(learner.key, KEYS)
+    key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
+    observation = env.observe(state, params)
+    novice_action = sample_novice_action(problem, learner, key_propose, observation)
+    if action is None:
+        action = query_expert(problem, learner, key_expert, observation)
+    takeover = learner.takeover
+    executed = jnp.where(takeover, action, jnp.clip(novice_action, -1.0, 1.0))
+    if problem.algorithm.predicted_steps:
+        predicted = look_ahead(problem, learner, key_ahead, novice_action)
+    else:
+        predicted = no_prediction()
+    after, outcome = env.transition(key_env, state, executed, params)
+    interaction = Interaction(
+        observation=observation,
+        next_observation=env.observe(after, params),
+        novice_action=novice_action,
+        expert_action=action,
+        executed_action=executed,
+        takeover=takeover,
+        takeover_start=takeover & started,
+        reward=outcome.reward,
+        cost=outcome.cost,
+        terminated=outcome.terminated,
+        truncated=outcome.truncated,
+        success=outcome.success,
+        predicted=predicted,
+    )
+    done = outcome.terminated | outcome.truncated
+    restarted = jax.lax.cond(done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset)
+    learner = dataclasses.replace(learner, key=key)
+    learner = store(problem, learner, interaction, outcome.physics_diverged)
+    # a takeover ends with its episode; the gate next runs at a multiple of K
+    learner = dataclasses.replace(learner, env_state=restarted, takeover=takeover & ~done)
+    return learner, interaction
+
+
+def store(
+    problem: Problem,
+    learner: Learner,
+    step: Interaction,
+    physics_diverged: jax.Array | bool = False,
+) -> Learner:
+    """Give a step to the method, and count it."""
+    counters, done = learner.counters, step.terminated | step.truncated
+    return dataclasses.replace(
+        learner,
+        algorithm=problem.algorithm.store(learner.algorithm, step, learner.hparams),
+        counters=Counters(
+            steps=counters.steps + 1,
+            human_data=counters.human_data + step.takeover,
+            takeovers=counters.takeovers + step.takeover_start,
+            episodes=counters.episodes + done,
+            successes=counters.successes + step.success,
+            cost=counters.cost + step.cost,
+            physics_diverged=counters.physics_diverged + physics_diverged,
+        ),
+    )
+
+
+def ingest(problem: Problem, learner: Learner, step: Interaction) -> Learner:
+    """Store a recorded step as if it were made now."""
+    key = jax.random.split(learner.key, KEYS)[0]  # as `interact` would leave it
+    return store(problem, dataclasses.replace(learner, key=key), step)
+
+
+def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
+    """One update; where a loss is not finite, what was learned stays as it was.
+
+    Args:
+        learner: Before the update.
+        update: `Algorithm.update` or `Algorithm.fit`.
+    """
+    key, key_update = jax.random.split(learner.key)
+    before = learner.algorithm
+    updated, metrics = update(before, key_update, learner.hparams)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)]))
+    diverged = learner.diverged | ~finite
+    kept = jax.tree.map(
+        lambda new, old: jnp.where(diverged, old, new), updated.learned, before.learned
+    )
+    updated = dataclasses.replace(updated, learned=kept)
+    return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
 
 
 def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:

@@ -7,6 +7,7 @@ takeover is decided outside instead of by a gate.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,9 +16,20 @@ import jax.numpy as jnp
 
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.interaction import Learner, Steps, make_steps, summarise
+from ppl_jax.interaction import (
+    Learner,
+    Problem,
+    ingest,
+    init,
+    interact,
+    learn,
+    make_problem,
+    sample_novice_action,
+    summarise,
+    transition_of,
+)
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import predict, predictor
+from ppl_jax.predictors import predict
 from ppl_jax.types import Env, Interaction, Trajectory
 
 PyTree = Any
@@ -72,75 +84,79 @@ def make_live(
     Raises:
         ValueError: If the environment lacks the predictor that `config` names.
     """
-    params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
-    predicted_transition = predictor(config.predictor).make(env)
-    steps = make_steps(env, None, algorithm, config, params=params)
-
-    def predict_path(learner: Learner, action: jax.Array, mine: jax.Array) -> Trajectory:
-        key_propose, key_predict = jax.random.split(learner.key)
-        observation = env.observe(learner.env_state, params)
-
-        def transition(*args: Any) -> Any:
-            return predicted_transition(*args, learner.hparams.predictor)
-
-        proposed = jnp.clip(
-            steps.sample_novice_action(learner, key_propose, observation), -1.0, 1.0
-        )
-        return predict(
-            env,
-            transition,
-            key_predict,
-            learner.env_state,
-            action=jnp.where(mine, action, proposed),
-            params=params,
-            horizon=config.prediction_horizon,
-            place=place,
-        )
-
-    def play(
-        learner: Learner, takeover: jax.Array, action: jax.Array
-    ) -> tuple[Learner, Interaction]:
-        started = takeover & ~learner.takeover
-        learner = dataclasses.replace(learner, takeover=takeover)
-        return steps.interact(learner, started, jnp.clip(action, -1.0, 1.0))
-
-    functions = _learning(env, steps, algorithm, params)
+    problem = make_problem(env, None, algorithm, config, params=env_params)
     return LiveFunctions(
-        init=steps.init, predict_path=predict_path, play=play, algorithm=algorithm, **functions
+        init=functools.partial(init, problem),
+        predict_path=functools.partial(predict_path, problem, place),
+        play=functools.partial(play, problem),
+        learn=lambda learner: learn(learner, algorithm.update),
+        fit=functools.partial(fit, problem),
+        restart=functools.partial(restart, problem),
+        ingest=functools.partial(ingest_all, problem),
+        algorithm=algorithm,
     )
 
 
-def _learning(
-    env: Env, steps: Steps, algorithm: Algorithm, params: PyTree
-) -> dict[str, Callable[..., Any]]:
-    """The `LiveFunctions` that do not choose an action: learn, fit, restart and ingest."""
+def predict_path(
+    problem: Problem,
+    place: Callable[[PyTree], jax.Array] | None,
+    learner: Learner,
+    action: jax.Array,
+    mine: jax.Array,
+) -> Trajectory:
+    """See `LiveFunctions`."""
+    key_propose, key_predict = jax.random.split(learner.key)
+    observation = problem.env.observe(learner.env_state, problem.params)
+    novice_action = sample_novice_action(problem, learner, key_propose, observation)
+    return predict(
+        problem.env,
+        transition_of(problem, learner.hparams.predictor),
+        key_predict,
+        learner.env_state,
+        action=jnp.where(mine, action, jnp.clip(novice_action, -1.0, 1.0)),
+        params=problem.params,
+        horizon=problem.config.prediction_horizon,
+        place=place,
+    )
 
-    def learn(learner: Learner) -> tuple[Learner, Metrics]:
-        return steps.learn(learner, algorithm.update)
 
-    def fit(learner: Learner, updates: int) -> tuple[Learner, Metrics]:
-        def step(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-            return steps.learn(learner, algorithm.fit or algorithm.update)
+def play(
+    problem: Problem, learner: Learner, takeover: jax.Array, action: jax.Array
+) -> tuple[Learner, Interaction]:
+    """See `LiveFunctions`."""
+    started = takeover & ~learner.takeover
+    learner = dataclasses.replace(learner, takeover=takeover)
+    return interact(problem, learner, started, jnp.clip(action, -1.0, 1.0))
 
-        learner, metrics = jax.lax.scan(step, learner, None, length=updates)
-        return learner, jax.tree.map(jnp.mean, metrics)
 
-    def restart(learner: Learner) -> Learner:
-        key, key_reset = jax.random.split(learner.key)
-        _, state = env.reset(key_reset, params)
-        return dataclasses.replace(learner, env_state=state, key=key, takeover=jnp.zeros((), bool))
+def fit(problem: Problem, learner: Learner, updates: int) -> tuple[Learner, Metrics]:
+    """See `LiveFunctions`."""
+    update = problem.algorithm.fit or problem.algorithm.update
 
-    def ingest(
-        learner: Learner, interactions: Interaction, learning: bool = True
-    ) -> tuple[Learner, Metrics]:
-        before = learner.counters
+    def step(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+        return learn(learner, update)
 
-        def step(learner: Learner, row: Interaction) -> tuple[Learner, Metrics]:
-            learner = steps.ingest(learner, row)
-            return learn(learner) if learning else (learner, {})
+    learner, metrics = jax.lax.scan(step, learner, None, length=updates)
+    return learner, jax.tree.map(jnp.mean, metrics)
 
-        learner, metrics = jax.lax.scan(step, learner, interactions)
-        return learner, summarise(metrics, before, learner.counters)
 
-    return {"learn": learn, "fit": fit, "restart": restart, "ingest": ingest}
+def restart(problem: Problem, learner: Learner) -> Learner:
+    """See `LiveFunctions`."""
+    key, key_reset = jax.random.split(learner.key)
+    _, state = problem.env.reset(key_reset, problem.params)
+    return dataclasses.replace(learner, env_state=state, key=key, takeover=jnp.zeros((), bool))
+
+
+def ingest_all(
+    problem: Problem, learner: Learner, interactions: Interaction, learning: bool = True
+) -> tuple[Learner, Metrics]:
+    """See `LiveFunctions.ingest`."""
+    before = learner.counters
+
+    def step(learner: Learner, row: Interaction) -> tuple[Learner, Metrics]:
+        learner = ingest(problem, learner, row)
+        return learn(learner, problem.algorithm.update) if learning else (learner, {})
+
+    learner, metrics = jax.lax.scan(step, learner, interactions)
+    return learner, summarise(metrics, before, learner.counters)

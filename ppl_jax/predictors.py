@@ -99,9 +99,9 @@ class Predictor(NamedTuple):
     """A registered predictor.
 
     Attributes:
-        make: `make(env) -> transition(key, state, action, params, hparams)`, the transition that
-            predictions use; `hparams` are the predictor's own. It raises `ValueError` where the
-            environment has none.
+        make: `make(env) -> transition(key, state, action, params, *, hparams)`, the transition
+            that predictions use; `hparams` are the predictor's own. It raises `ValueError` where
+            the environment has none.
         hparams: Class of its traced settings.
     """
 
@@ -121,7 +121,7 @@ def _environments_own(name: str) -> Callable[[Env], Callable[..., tuple[Any, Out
         transition = env.predictors[name]
 
         def predicted(
-            key: jax.Array, state: Any, action: jax.Array, params: Any, hparams: Any
+            key: jax.Array, state: Any, action: jax.Array, params: Any, *, hparams: Any
         ) -> tuple[Any, Outcome]:
             del hparams
             return transition(key, state, action, params)
@@ -144,7 +144,7 @@ def register_predictor(
 
     Args:
         name: As in `--predictor NAME`.
-        make: `make(env) -> transition(key, state, action, params, hparams) -> (state, outcome)`;
+        make: `make(env) -> transition(key, state, action, params, *, hparams) -> (state, outcome)`;
             it raises `ValueError` for an environment that it cannot predict.
         hparams: Class of its own traced settings: a `flax.struct.dataclass` whose fields are made
             by `ppl_jax.fields.setting(..., group="predictor")`.

@@ -81,13 +81,15 @@ def make_run(
     def look(learner: Learner, held_out: PyTree) -> RunHistory:
         layers = functions.algorithm.policy(learner.algorithm)
         mean, scale = env.spec.observation_mean, env.spec.observation_scale
-        policy = SavedPolicy(layers, "relu", "tanh", mean, scale)
+        policy = SavedPolicy(
+            weights=layers, activation="relu", output="tanh", obs_mean=mean, obs_scale=scale
+        )
 
         def act(key: jax.Array, state: Any, observation: jax.Array, params: Any) -> jax.Array:
             return experts.act(policy, observation)
 
         episodes = make_evaluate(env, act)(held_out, jax.random.key(0))
-        return RunHistory(episodes, learner.counters, learner.diverged)
+        return RunHistory(episodes=episodes, counters=learner.counters, diverged=learner.diverged)
 
     def run(key: jax.Array, hparams: HParams, held_out: PyTree) -> Any:
         learner, curves = functions.init(key, hparams), []

@@ -21,9 +21,20 @@ import jax.numpy as jnp
 from ppl_jax.algorithms.base import Algorithm, MakeAlgorithm
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.gates import gate, shared_gate
-from ppl_jax.interaction import Learner, make_steps, summarise
+from ppl_jax.interaction import (
+    Learner,
+    Problem,
+    init,
+    interact,
+    learn,
+    make_problem,
+    query_expert,
+    sample_novice_action,
+    summarise,
+    transition_of,
+)
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import predict, predictor
+from ppl_jax.predictors import predict
 from ppl_jax.types import DecisionPoint, Env, Expert
 
 PyTree = Any
@@ -82,119 +93,177 @@ def make_train(
         ValueError: If the environment lacks the predictor that `config` names, the expert the
             density that its gate needs, or the run's length does not fit the method's rounds.
     """
-    params = env.default_params if env_params is None else env_params
     algorithm = make_algorithm(env.spec, config)
-    predicted_transition = predictor(config.predictor).make(env)
-    decide_takeover = algorithm.decide or shared_gate(config.gate, env.spec.observation_scale)
-    compares = algorithm.needs_expert_rollout or (
-        algorithm.decide is None and gate(config.gate).needs_expert_rollout
-    )
-    init, sample_novice_action, query_expert, interact, _, learn = make_steps(
-        env, expert, algorithm, config, params=params
-    )
-    interval = config.decision_interval
+    problem = make_problem(env, expert, algorithm, config, params=env_params)
     check_rounds(algorithm, config)
-    density = getattr(expert, "log_density", None)
-    if density is None:
-        if algorithm.decide is None and gate(config.gate).needs_density:
-            raise ValueError(
-                f"gate {config.gate!r} needs an expert with a density, such as a neural one: "
-                "give one, or another gate"
-            )
-        density = lambda observation, action: jnp.nan  # noqa: E731
+    takeovers = make_takeovers(problem)
+    return TrainFunctions(
+        init=functools.partial(init, problem),
+        run_chunk=functools.partial(run_chunk, problem, takeovers),
+        train=functools.partial(train, problem, takeovers),
+        algorithm=algorithm,
+    )
 
-    def decide(learner: Learner, key: jax.Array) -> jax.Array:
-        """Whether the expert takes the next block."""
-        key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
-        observation = env.observe(learner.env_state, params)
-        action = sample_novice_action(learner, key_propose, observation)
 
-        def transition(*args: Any) -> Any:
-            return predicted_transition(*args, learner.hparams.predictor)
+@dataclasses.dataclass(frozen=True)
+class Takeovers:
+    """How a run decides who acts next; static.
 
-        roll = functools.partial(
-            predict,
-            env,
-            transition,
-            key_predict,
-            learner.env_state,
-            action=action,
-            params=params,
-            horizon=config.prediction_horizon,
-            observe=compares,
+    Attributes:
+        rule: `rule(algorithm state, DecisionPoint, hparams) -> bool`.
+        needs_expert_rollout: The rule reads the expert's own predicted path.
+        closed_loop: The novice acts anew at every predicted state, instead of holding its action.
+        log_density: `log_density(observation, action)` of the expert; NaN of one that has none.
+    """
+
+    rule: Callable[[PyTree, DecisionPoint, HParams], jax.Array]
+    needs_expert_rollout: bool
+    closed_loop: bool
+    log_density: Callable[[jax.Array, jax.Array], jax.Array | float]
+
+
+def make_takeovers(problem: Problem) -> Takeovers:
+    """The rule of the method, or else of the gate that the settings name.
+
+    Raises:
+        ValueError: If the gate needs a density that the expert lacks.
+    """
+    algorithm, config = problem.algorithm, problem.config
+    shared = gate(config.gate) if algorithm.decide is None else None
+    needs_expert_rollout = algorithm.needs_expert_rollout or (
+        shared is not None and shared.needs_expert_rollout
+    )
+    density = getattr(problem.expert, "log_density", None)
+    if density is None and shared is not None and shared.needs_density:
+        raise ValueError(
+            f"gate {config.gate!r} needs an expert with a density, such as a neural one: "
+            "give one, or another gate"
         )
-        asked_again = config.gate_rollout == "closed_loop" or compares
-        act = functools.partial(algorithm.act, learner.algorithm, key_act)
-        point = DecisionPoint(
-            observation=observation,
-            novice_action=action,
-            expert_action=query_expert(learner, key_expert, observation),
-            takeover=learner.takeover,
-            trajectory=roll(act=act if asked_again else None),
-            experts=roll(expert=expert) if compares else None,
-            log_density=jnp.asarray(density(observation, jnp.clip(action, -1.0, 1.0))),
-        )
-        return decide_takeover(learner.algorithm, point, learner.hparams)
+    return Takeovers(
+        rule=algorithm.decide or shared_gate(config.gate, problem.env.spec.observation_scale),
+        needs_expert_rollout=needs_expert_rollout,
+        closed_loop=config.gate_rollout == "closed_loop" or needs_expert_rollout,
+        log_density=density or (lambda observation, action: jnp.nan),
+    )
+
+
+def decide(problem: Problem, takeovers: Takeovers, learner: Learner, key: jax.Array) -> jax.Array:
+    """Whether the expert takes the next block of K steps."""
+    env, params = problem.env, problem.params
+    key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
+    observation = env.observe(learner.env_state, params)
+    action = sample_novice_action(problem, learner, key_propose, observation)
+    roll = functools.partial(
+        predict,
+        env,
+        transition_of(problem, learner.hparams.predictor),
+        key_predict,
+        learner.env_state,
+        action=action,
+        params=params,
+        horizon=problem.config.prediction_horizon,
+        observe=takeovers.needs_expert_rollout,
+    )
+    act = functools.partial(problem.algorithm.act, learner.algorithm, key_act)
+    point = DecisionPoint(
+        observation=observation,
+        novice_action=action,
+        expert_action=query_expert(problem, learner, key_expert, observation),
+        takeover=learner.takeover,
+        trajectory=roll(act=act if takeovers.closed_loop else None),
+        experts=roll(expert=problem.expert) if takeovers.needs_expert_rollout else None,
+        log_density=jnp.asarray(takeovers.log_density(observation, jnp.clip(action, -1.0, 1.0))),
+    )
+    return takeovers.rule(learner.algorithm, point, learner.hparams)
+
+
+def block(problem: Problem, takeovers: Takeovers, learner: Learner) -> tuple[Learner, Metrics]:
+    """One decision and the K steps that it holds for, each followed by an update.
+
+    Methods that learn in rounds (`Algorithm.update_every`) make their updates in
+    `round_of_blocks`.
+    """
+    algorithm, interval = problem.algorithm, problem.config.decision_interval
+    key, key_decide = jax.random.split(learner.key)
+    was_expert = learner.takeover
+    takeover = decide(problem, takeovers, learner, key_decide)
+    learner = dataclasses.replace(learner, takeover=takeover, key=key)
 
     def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
-        learner, _ = interact(learner, started)
+        learner, _ = interact(problem, learner, started)
         if algorithm.update_every > 1:
             return learner, {}
         return learn(learner, algorithm.update)
 
-    def block(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-        key, key_decide = jax.random.split(learner.key)
-        was_expert = learner.takeover
-        takeover = decide(learner, key_decide)
-        learner = dataclasses.replace(learner, takeover=takeover, key=key)
-        first = jnp.arange(interval) == 0
-        learner, metrics = jax.lax.scan(step, learner, first & ~was_expert)
-        return learner, jax.tree.map(jnp.mean, metrics)
+    first = jnp.arange(interval) == 0
+    learner, metrics = jax.lax.scan(step, learner, first & ~was_expert)
+    return learner, jax.tree.map(jnp.mean, metrics)
 
-    def round_of_blocks(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-        learner = jax.lax.scan(block, learner, None, length=algorithm.update_every // interval)[0]
-        return learn(learner, algorithm.update)
 
-    def demonstrated_step(learner: Learner, _: None) -> tuple[Learner, None]:
-        started = ~learner.takeover  # at the start of an episode
-        learner = dataclasses.replace(learner, takeover=jnp.ones((), bool))
-        return interact(learner, started)[0], None
+def round_of_blocks(
+    problem: Problem, takeovers: Takeovers, learner: Learner
+) -> tuple[Learner, Metrics]:
+    """The `update_every` steps of a round, then its update."""
 
-    def fitted(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-        return learn(learner, algorithm.fit or algorithm.update)
+    def one(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+        return block(problem, takeovers, learner)
 
-    def run_chunk(
-        learner: Learner, blocks: int, phase: Phase = "interact"
-    ) -> tuple[Learner, Metrics]:
-        metrics: Metrics
-        before, length = learner.counters, blocks * interval
+    blocks = problem.algorithm.update_every // problem.config.decision_interval
+    learner, _ = jax.lax.scan(one, learner, None, length=blocks)
+    return learn(learner, problem.algorithm.update)
+
+
+def demonstrate(problem: Problem, learner: Learner) -> tuple[Learner, Metrics]:
+    """One step of the expert, which nothing is learned from yet."""
+    started = ~learner.takeover  # at the start of an episode
+    learner = dataclasses.replace(learner, takeover=jnp.ones((), bool))
+    return interact(problem, learner, started)[0], {}
+
+
+def run_chunk(
+    problem: Problem,
+    takeovers: Takeovers,
+    learner: Learner,
+    blocks: int,
+    phase: Phase = "interact",
+) -> tuple[Learner, Metrics]:
+    """A static number of blocks of K steps (or updates, in phase "fit"); means over them."""
+    algorithm, length = problem.algorithm, blocks * problem.config.decision_interval
+
+    def one(learner: Learner, _: None) -> tuple[Learner, Metrics]:
         if phase == "demonstrate":
-            learner, _ = jax.lax.scan(demonstrated_step, learner, None, length=length)
-            metrics = {}
-        elif phase == "fit":
-            learner, metrics = jax.lax.scan(fitted, learner, None, length=length)
-        elif algorithm.update_every > 1:
-            rounds = length // algorithm.update_every
-            learner, metrics = jax.lax.scan(round_of_blocks, learner, None, length=rounds)
-        else:
-            learner, metrics = jax.lax.scan(block, learner, None, length=blocks)
-        return learner, summarise(metrics, before, learner.counters)
+            return demonstrate(problem, learner)
+        if phase == "fit":
+            return learn(learner, algorithm.fit or algorithm.update)
+        if algorithm.update_every > 1:
+            return round_of_blocks(problem, takeovers, learner)
+        return block(problem, takeovers, learner)
 
-    def train(key: jax.Array, hparams: HParams) -> tuple[Learner, Metrics]:
-        learner = init(key, hparams)
-        *first, (last, length) = phases(config)
-        for phase, count in first:
-            learner, _ = run_chunk(learner, count // interval, phase)
-        unit = algorithm.update_every if last == "interact" else 1
-        units = length // max(unit, interval)
-        parts = max(n for n in range(1, 11) if units % n == 0)
+    times = length
+    if phase == "interact":
+        times = length // algorithm.update_every if algorithm.update_every > 1 else blocks
+    before = learner.counters
+    learner, metrics = jax.lax.scan(one, learner, None, length=times)
+    return learner, summarise(metrics, before, learner.counters)
 
-        def part(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-            return run_chunk(learner, length // parts // interval, last)
 
-        return jax.lax.scan(part, learner, None, length=parts)
+def train(
+    problem: Problem, takeovers: Takeovers, key: jax.Array, hparams: HParams
+) -> tuple[Learner, Metrics]:
+    """A whole run: its phases, the last one in (at most) ten parts with their metrics."""
+    interval, every = problem.config.decision_interval, problem.algorithm.update_every
+    learner = init(problem, key, hparams)
+    *first, (last, length) = phases(problem.config)
+    for phase, count in first:
+        learner, _ = run_chunk(problem, takeovers, learner, count // interval, phase)
+    unit = every if last == "interact" else 1
+    units = length // max(unit, interval)
+    parts = max(n for n in range(1, 11) if units % n == 0)
 
-    return TrainFunctions(init, run_chunk, train, algorithm)
+    def part(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+        return run_chunk(problem, takeovers, learner, length // parts // interval, last)
+
+    return jax.lax.scan(part, learner, None, length=parts)
 
 
 def check_rounds(algorithm: Algorithm, config: TrainConfig) -> None:

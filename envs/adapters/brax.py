@@ -96,7 +96,12 @@ class FromBrax(Environment):
             raise ValueError(f"{name}: the observation must be one flat array, got {observation}")
         size = observation.shape[0]
         zeros, ones = np.zeros(size, np.float32), np.ones(size, np.float32)
-        self.spec = EnvSpec(size, inner.action_size, zeros, ones)
+        self.spec = EnvSpec(
+            observation_size=size,
+            action_size=inner.action_size,
+            observation_mean=zeros,
+            observation_scale=ones,
+        )
         self.default_params = BraxParams(jnp.asarray(training, jnp.int32))
         self.held_out_params = BraxParams(jnp.asarray(held_out, jnp.int32))
 

@@ -72,7 +72,7 @@ def first_block(lanes: int, width: float) -> Block:
     for road, lane in ((spawn, right), (exit_road, extend(right, FIRST_LENGTH - ENTRANCE_LENGTH))):
         network.add_road(road, lane, lanes)
         network.add_oncoming(road)
-    return Block("I", network, spawn, (exit_road,))
+    return Block(kind="I", network=network, entry=spawn, sockets=(exit_road,))
 
 
 def straight_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
@@ -81,7 +81,15 @@ def straight_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bloc
     road = (entry[1], node(number, "S", 0, 0))
     network.add_road(road, extend(lanes[-1], p["length"]), len(lanes))
     network.add_oncoming(road)
-    return Block("S", network, entry, (road,), inner=(road,), accident_roads=(road,), parameters=p)
+    return Block(
+        kind="S",
+        network=network,
+        entry=entry,
+        sockets=(road,),
+        inner=(road,),
+        accident_roads=(road,),
+        parameters=p,
+    )
 
 
 def curve_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
@@ -97,7 +105,15 @@ def curve_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
     for road, lane in zip(roads, parts, strict=True):
         network.add_road(road, lane, len(lanes))
         network.add_oncoming(road)
-    return Block("C", network, entry, roads[1:], inner=roads, accident_roads=roads, parameters=p)
+    return Block(
+        kind="C",
+        network=network,
+        entry=entry,
+        sockets=roads[1:],
+        inner=roads,
+        accident_roads=roads,
+        parameters=p,
+    )
 
 
 RAMP_RADIUS, RAMP_ANGLE, RAMP_LENGTH, RAMP_CONNECT = 40.0, math.radians(10.0), 15.0, 20.0
@@ -139,10 +155,10 @@ def in_ramp_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block
     network.add_lane(merge, acceleration)
     network.add_lane(DECORATION, _extension(acceleration.end, p["extension_length"], width, SHRINK))
     return Block(
-        "r",
-        network,
-        entry,
-        (socket,),
+        kind="r",
+        network=network,
+        entry=entry,
+        sockets=(socket,),
         inner=(approach, merge, *ramp),
         accident_roads=(approach, merge),
         parameters=p,
@@ -173,10 +189,10 @@ def out_ramp_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bloc
     for road, lane in zip(ramp, (right_bend, connect, left_bend, last), strict=True):
         network.add_lane(road, lane)
     return Block(
-        "R",
-        network,
-        entry,
-        (socket,),
+        kind="R",
+        network=network,
+        entry=entry,
+        sockets=(socket,),
         inner=(leave, socket, *ramp),
         accident_roads=(leave, socket),
         parameters=p,
@@ -211,7 +227,9 @@ def intersection_block(base: RoadNetwork, entry: Road, number: int, p: dict, *, 
             incoming = reverse_road(exits[part])
             lanes = network.roads[incoming]
     arms = tuple(reverse_road(road) for road in exits)
-    return Block(kind, network, entry, tuple(exits), arms=arms, parameters=p)
+    return Block(
+        kind=kind, network=network, entry=entry, sockets=tuple(exits), arms=arms, parameters=p
+    )
 
 
 def t_intersection_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Block:
@@ -275,10 +293,10 @@ def roundabout_block(base: RoadNetwork, entry: Road, number: int, p: dict) -> Bl
         following = node(number, "O", (part + 1) % 4, 0)
         network.add_road((names[1], following), inner, count, kerb=False)
     return Block(
-        "O",
-        network,
-        entry,
-        tuple(sockets),
+        kind="O",
+        network=network,
+        entry=entry,
+        sockets=tuple(sockets),
         arms=tuple(reverse_road(road) for road in sockets),
         inner=tuple(ring),
         parameters=p,
@@ -300,29 +318,37 @@ class BlockKind:
 
 BLOCK_KINDS: dict[str, BlockKind] = {
     "C": BlockKind(
-        0.3,
-        lambda rng: {
+        probability=0.3,
+        draw=lambda rng: {
             **_uniform(length=(40, 80), radius=(25, 60), angle=(45, 135))(rng),
             "dir": int(rng.integers(2)),
         },
-        curve_block,
+        build=curve_block,
     ),
-    "S": BlockKind(0.1, _uniform(length=(40, 80)), straight_block),
-    "r": BlockKind(0.1, _uniform(length=(20, 40), extension_length=(20, 40)), in_ramp_block),
-    "R": BlockKind(0.1, _uniform(length=(20, 40), extension_length=(20, 40)), out_ramp_block),
-    "X": BlockKind(0.15, lambda rng: {"radius": 10.0}, intersection_block),
+    "S": BlockKind(probability=0.1, draw=_uniform(length=(40, 80)), build=straight_block),
+    "r": BlockKind(
+        probability=0.1,
+        draw=_uniform(length=(20, 40), extension_length=(20, 40)),
+        build=in_ramp_block,
+    ),
+    "R": BlockKind(
+        probability=0.1,
+        draw=_uniform(length=(20, 40), extension_length=(20, 40)),
+        build=out_ramp_block,
+    ),
+    "X": BlockKind(probability=0.15, draw=lambda rng: {"radius": 10.0}, build=intersection_block),
     "T": BlockKind(
-        0.15,
-        lambda rng: {"radius": 10.0, "t_type": int(rng.integers(3))},
-        t_intersection_block,
+        probability=0.15,
+        draw=lambda rng: {"radius": 10.0, "t_type": int(rng.integers(3))},
+        build=t_intersection_block,
     ),
     "O": BlockKind(
-        0.1,
-        lambda rng: {
+        probability=0.1,
+        draw=lambda rng: {
             **_uniform(exit_radius=(5, 15), inner_radius=(15, 45))(rng),
             "angle": 60.0,
         },
-        roundabout_block,
+        build=roundabout_block,
     ),
 }
 

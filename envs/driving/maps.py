@@ -40,10 +40,16 @@ class _Model:
 
 
 _MODELS = (
-    _Model(0.2, 4.3, 1.7, 800.0, (350.0, 550.0), (35.0, 80.0)),
-    _Model(0.3, 4.6, 1.85, 1200.0, (650.0, 850.0), (60.0, 150.0)),
-    _Model(0.3, 4.87, 2.046, 1300.0, (450.0, 650.0), (60.0, 120.0)),
-    _Model(0.2, 5.74, 2.3, 1600.0, (500.0, 700.0), (50.0, 100.0)),
+    _Model(share=0.2, length=4.3, width=1.7, mass=800.0, engine=(350.0, 550.0), brake=(35.0, 80.0)),
+    _Model(
+        share=0.3, length=4.6, width=1.85, mass=1200.0, engine=(650.0, 850.0), brake=(60.0, 150.0)
+    ),
+    _Model(
+        share=0.3, length=4.87, width=2.046, mass=1300.0, engine=(450.0, 650.0), brake=(60.0, 120.0)
+    ),
+    _Model(
+        share=0.2, length=5.74, width=2.3, mass=1600.0, engine=(500.0, 700.0), brake=(50.0, 100.0)
+    ),
 )
 
 
@@ -216,7 +222,15 @@ def _placed(
     lateral: float = 0.0,
 ) -> ObjectSpec:
     x, y = lane.position(long, lateral)
-    return ObjectSpec(kind, float(x), float(y), lane.heading_at(long), length, width, name)
+    return ObjectSpec(
+        kind=kind,
+        x=float(x),
+        y=float(y),
+        heading=lane.heading_at(long),
+        length=length,
+        width=width,
+        lane=name,
+    )
 
 
 def _cones(lane: Lane, name: tuple[Road, int], on_left: bool) -> list[ObjectSpec]:
@@ -276,12 +290,12 @@ def _traffic(
                 model = _draw_model(rng)
                 vehicles.append(
                     VehicleSpec(
-                        model.length,
-                        model.width,
-                        block.entry,
-                        (road, number),
-                        long,
-                        nodes,
+                        length=model.length,
+                        width=model.width,
+                        trigger=block.entry,
+                        lane=(road, number),
+                        long=long,
+                        nodes=nodes,
                         patience=int(rng.integers(50)),
                         mass=model.mass,
                         engine_force=float(rng.uniform(*model.engine)),

@@ -98,25 +98,25 @@ def _object(entry: dict) -> ObjectSpec:
     if kind == "barrier":  # its "length" of 2 m lies across the lane
         length, width = width, length
     return ObjectSpec(
-        kind,
-        x,
-        y,
-        heading,
-        length,
-        entry["radius"] if round_kind else width,
-        None if lane is None else ((lane[0], lane[1]), int(lane[2])),
+        kind=kind,
+        x=x,
+        y=y,
+        heading=heading,
+        length=length,
+        width=entry["radius"] if round_kind else width,
+        lane=None if lane is None else ((lane[0], lane[1]), int(lane[2])),
     )
 
 
 def _vehicle(entry: dict) -> VehicleSpec:
     road, number = tuple(entry["spawn_lane_index"][:2]), int(entry["spawn_lane_index"][2])
     return VehicleSpec(
-        entry["length"],
-        entry["width"],
-        tuple(entry["trigger_road"]),
-        (road, number),
-        entry["spawn_longitude"],
-        tuple(entry["destination_checkpoints"]),
+        length=entry["length"],
+        width=entry["width"],
+        trigger=tuple(entry["trigger_road"]),
+        lane=(road, number),
+        long=entry["spawn_longitude"],
+        nodes=tuple(entry["destination_checkpoints"]),
         patience=0,
         mass=entry["mass"],
         engine_force=entry["max_engine_force"],

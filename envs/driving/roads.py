@@ -86,7 +86,14 @@ class Lane:
 def straight(start, end, width: float, kerb: bool = False, *, taper: int = STRAIGHT) -> Lane:
     """A straight lane between two points."""
     start, end = np.asarray(start, float), np.asarray(end, float)
-    return Lane(start, end, float(np.hypot(*(end - start))), width, kerb=kerb, taper=taper)
+    return Lane(
+        start=start,
+        end=end,
+        length=float(np.hypot(*(end - start))),
+        width=width,
+        kerb=kerb,
+        taper=taper,
+    )
 
 
 def arc(center, radius: float, phase: float, angle: float, *, turn: int, width: float, kerb=False):
@@ -97,16 +104,16 @@ def arc(center, radius: float, phase: float, angle: float, *, turn: int, width: 
         return center + radius * np.array([np.cos(phi), np.sin(phi)])
 
     return Lane(
-        point(phase),
-        point(phase + turn * angle),
-        radius * angle,
-        width,
-        turn,
-        center,
-        radius,
-        phase,
-        angle,
-        kerb,
+        start=point(phase),
+        end=point(phase + turn * angle),
+        length=radius * angle,
+        width=width,
+        turn=turn,
+        center=center,
+        radius=radius,
+        phase=phase,
+        angle=angle,
+        kerb=kerb,
     )
 
 
@@ -168,7 +175,7 @@ class RoadNetwork:
         """Append a lane on the right of a road (made when new)."""
         self.roads.setdefault(road, []).append(lane)
 
-    def add_road(self, road: Road, lane: Lane, count: int, leftward=True, kerb=True) -> None:
+    def add_road(self, road: Road, lane: Lane, count: int, *, leftward=True, kerb=True) -> None:
         """Add `count` parallel lanes starting from `lane`.
 
         `lane` becomes the rightmost one (`leftward`) or the leftmost. The rightmost lane gets

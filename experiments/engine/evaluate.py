@@ -37,7 +37,9 @@ class EvaluationRow(NamedTuple):
 @functools.partial(jax.jit, static_argnums=(0, 2, 3))
 def _episodes(env: Env, arrays: Any, activation: str, output: str, params: Any, key: jax.Array):
     weights, mean, scale = arrays
-    policy = SavedPolicy(weights, activation, output, mean, scale)
+    policy = SavedPolicy(
+        weights=weights, activation=activation, output=output, obs_mean=mean, obs_scale=scale
+    )
 
     def act(key: jax.Array, state: Any, observation: jax.Array, params: Any) -> jax.Array:
         return experts.act(policy, observation)
@@ -67,18 +69,18 @@ def evaluate_policy(
 
 def rows_of(episodes: Episodes, numbers: Any, step: int) -> list[EvaluationRow]:
     """Episodes as rows."""
-    columns = [np.asarray(column) for column in episodes]
+    played = jax.device_get(episodes)
     return [
         EvaluationRow(
-            step,
-            int(numbers[i]),
-            int(columns[0][i]),
-            round(float(columns[1][i]), 4),
-            round(float(columns[3][i]), 5),
-            round(float(columns[2][i]), 4),
-            int(columns[4][i]),
+            step=step,
+            scenario=int(numbers[i]),
+            success=int(played.success[i]),
+            episodic_return=round(float(played.episodic_return[i]), 4),
+            progress=round(float(played.progress[i]), 5),
+            episodic_cost=round(float(played.episodic_cost[i]), 4),
+            length=int(played.length[i]),
         )
-        for i in range(len(columns[0]))
+        for i in range(len(played.success))
     ]
 
 
@@ -99,13 +101,13 @@ def read_evaluation(run: Path) -> list[EvaluationRow]:
     with open(run / EVALUATION, newline="") as file:
         return [
             EvaluationRow(
-                int(row["step"]),
-                int(row["scenario"]),
-                int(row["success"]),
-                float(row["episodic_return"]),
-                float(row["progress"]),
-                float(row["episodic_cost"]),
-                int(row["length"]),
+                step=int(row["step"]),
+                scenario=int(row["scenario"]),
+                success=int(row["success"]),
+                episodic_return=float(row["episodic_return"]),
+                progress=float(row["progress"]),
+                episodic_cost=float(row["episodic_cost"]),
+                length=int(row["length"]),
             )
             for row in csv.DictReader(file)
         ]

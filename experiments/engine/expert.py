@@ -88,7 +88,7 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
             return folder.read_json(SUMMARY)
     first = done // config.batch_steps
     with Progress(config.batches * config.batch_steps, f"expert {settings.env}", done) as progress:
-        run = _Run(settings, folder, env, functions, progress)
+        run = _Run(settings, folder, env=env, functions=functions, progress=progress)
         learner = run.start(learner, first)
         progress.start()
         for batch in range(first + 1, config.batches + 1):
@@ -121,6 +121,7 @@ class _Run:
         self,
         settings: ExpertSettings,
         folder: RunFolder,
+        *,
         env: Env,
         functions: PPOFunctions,
         progress: Progress,

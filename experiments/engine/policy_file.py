@@ -98,7 +98,14 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
             raise ValueError(f"{name}: {field} holds a NaN or infinite number")
     if not (scale > 0).all():
         raise ValueError(f"{name}: obs_scale must be positive")
-    return SavedPolicy(weights, activation, output, mean, scale, log_std)
+    return SavedPolicy(
+        weights=weights,
+        activation=activation,
+        output=output,
+        obs_mean=mean,
+        obs_scale=scale,
+        log_std=log_std,
+    )
 
 
 def load_meta(path: str | Path) -> dict[str, Any]:

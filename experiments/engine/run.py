@@ -87,7 +87,11 @@ def saved_policy(env: Env, layers: Layers) -> SavedPolicy:
     """A trained policy as plain arrays on the environment's raw observation."""
     weights = [(np.asarray(w), np.asarray(b)) for w, b in layers]
     return SavedPolicy(
-        weights, "relu", "tanh", env.spec.observation_mean, env.spec.observation_scale
+        weights=weights,
+        activation="relu",
+        output="tanh",
+        obs_mean=env.spec.observation_mean,
+        obs_scale=env.spec.observation_scale,
     )
 
 
@@ -127,7 +131,7 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
     with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
-        runner = _Runner(settings, folder, env, functions, progress)
+        runner = _Runner(settings, folder, env=env, functions=functions, progress=progress)
         waiting = [chunk for chunk in plan if chunk.end > done]
         runner.compile(learner, waiting[-1])
         progress.start()
@@ -180,7 +184,15 @@ def _plan(config: TrainConfig, evaluate_every: int) -> list[_Chunk]:
             left, end = left - piece, end + piece
             step += 0 if phase == "fit" else piece
             # what demonstrations alone teach is seen once, when they are learnt
-            plan.append(_Chunk(phase, piece, end, step, interact or (phase == "fit" and not left)))
+            plan.append(
+                _Chunk(
+                    phase=phase,
+                    length=piece,
+                    end=end,
+                    step=step,
+                    evaluate=interact or (phase == "fit" and not left),
+                )
+            )
     if not plan[-1].evaluate:  # demonstrations that nothing is learnt from
         plan[-1] = dataclasses.replace(plan[-1], evaluate=True)
     return plan
@@ -299,6 +311,7 @@ class _Runner:
         self,
         settings: RunSettings,
         folder: RunFolder,
+        *,
         env: Env,
         functions: TrainFunctions,
         progress: Progress,

@@ -26,7 +26,7 @@ class SluggishHParams:
 def make_sluggish(env):
     """The transition that predictions use in an environment."""
 
-    def transition(key, state, action, params, hparams):
+    def transition(key, state, action, params, *, hparams):
         return env.transition(key, state, (1.0 - hparams.lag) * action, params)
 
     return transition

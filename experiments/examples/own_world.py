@@ -21,7 +21,12 @@ class Windy(Environment):
     """Stay within half a metre of 0. The parameters are the winds of the scenarios, [S] m/s."""
 
     name, max_episode_steps = "windy", 50
-    spec = EnvSpec(2, 1, np.zeros(2, np.float32), np.ones(2, np.float32))
+    spec = EnvSpec(
+        observation_size=2,
+        action_size=1,
+        observation_mean=np.zeros(2, np.float32),
+        observation_scale=np.ones(2, np.float32),
+    )
     default_params = np.linspace(-0.7, 0.7, 20, dtype=np.float32)
     held_out_params = np.linspace(-0.6, 0.6, 10, dtype=np.float32)
 

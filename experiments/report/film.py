@@ -110,7 +110,9 @@ def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
     scene = Scene(tree_index(env.held_out_params.scenarios, state.scenario))
 
     def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
-        return draw(scene, state, Paths(novice, takeover, expert), caption=caption)
+        return draw(
+            scene, state, Paths(novice=novice, takeover=takeover, expert=expert), caption=caption
+        )
 
     return (lambda state: state.ego.pose[:2]), picture
 
@@ -126,6 +128,6 @@ def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
 
     def picture(state: Any, novice: np.ndarray, takeover: bool, expert: np.ndarray, caption: str):
         del caption
-        return scene.draw(state, ArmPaths(novice, takeover, expert))
+        return scene.draw(state, ArmPaths(novice=novice, takeover=takeover, expert=expert))
 
     return env.grip_position, picture

@@ -305,7 +305,9 @@ def _point(
     by_seed = group.groupby("seed")[whole].mean()
     seeds = [int(seed) for seed in by_seed.index]
     measured = {name: by_seed[name].to_numpy(float) for name in whole}
-    point = Point(env, algorithm, values, step, seeds, measured)
+    point = Point(
+        env=env, algorithm=algorithm, values=values, step=step, seeds=seeds, measured=measured
+    )
     if played is None:
         return point
     mine = played[played["step"] == step]

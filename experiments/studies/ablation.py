@@ -55,7 +55,7 @@ def ablation(command: Ablation) -> None:
             common: dict[str, Any] = {"reference_policy": reference} if needs else {}
             settings = settings_of(command, "ppl", seed, given, **common)
             name = f"{command.env}/{label}/seed={seed}"
-            runs.append(Run(name, (), settings, label))
+            runs.append(Run(name=name, values=(), settings=settings, label=label))
     execute(runs, command.out, execution)
 
 
@@ -63,7 +63,9 @@ def _reference(command: Ablation, execution: Execution) -> Path:
     """Clone `reference_steps` expert steps, once; the policy file."""
     steps = {"demonstrations": command.reference_steps, "total_steps": command.reference_steps}
     settings = settings_of(command, "bc", 0, steps, own_length=True)
-    run = Run(f"{command.env}/reference/seed=0", (), settings, "reference")
+    run = Run(
+        name=f"{command.env}/reference/seed=0", values=(), settings=settings, label="reference"
+    )
     out = command.out.with_name(f"{command.out.name}-reference")
     execute([run], out, execution)
     return out / POLICIES / policy_name(run.name)

@@ -38,7 +38,9 @@ def compare(command: Compare) -> None:
         own = "total_steps" in changes
         for seed in command.seeds:
             settings = settings_of(command, name, seed, {}, own_length=own)
-            runs.append(Run(run_name(command.env, name, {}, seed), (), settings))
+            runs.append(
+                Run(name=run_name(command.env, name, {}, seed), values=(), settings=settings)
+            )
     execute(runs, command.out, Execution(processes=command.processes))
 
 

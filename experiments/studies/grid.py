@@ -39,31 +39,31 @@ HORIZONS = (1, 2, 4, 6, 8, 10)
 # H and the other settings are the paper's own; L beyond an environment's H is left out
 STUDIES = {
     "horizon": Study(
-        "the effect of L (Fig. 8), at the paper's length and half as far again",
-        ("ppl",),
-        {"preference_horizon": HORIZONS},
+        title="the effect of L (Fig. 8), at the paper's length and half as far again",
+        algorithms=("ppl",),
+        axes={"preference_horizon": HORIZONS},
         length=1.5,
         evaluations=3,
     ),
     "horizon_beta": Study(
-        "L x beta",
-        ("ppl",),
-        {"preference_horizon": (1, 2, 4, 6, 8), "beta": (0.03, 0.1, 0.3, 1.0)},
+        title="L x beta",
+        algorithms=("ppl",),
+        axes={"preference_horizon": (1, 2, 4, 6, 8), "beta": (0.03, 0.1, 0.3, 1.0)},
     ),
     "prediction_noise": Study(
-        "noise of the predicted states (Fig. 7)",
-        ("ppl", "pvp"),
-        {"prediction_noise": NOISES},
+        title="noise of the predicted states (Fig. 7)",
+        algorithms=("ppl", "pvp"),
+        axes={"prediction_noise": NOISES},
     ),
     "expert_noise": Study(
-        "an imperfect expert",
-        ("ppl", "pvp"),
-        {"expert_noise": (0.0, 0.1, 0.2, 0.4)},
+        title="an imperfect expert",
+        algorithms=("ppl", "pvp"),
+        axes={"expert_noise": (0.0, 0.1, 0.2, 0.4)},
     ),
     "predictor": Study(
-        "what the predictor knows",
-        ("ppl",),
-        {"predictor": ("simulator", "kinematic")},
+        title="what the predictor knows",
+        algorithms=("ppl",),
+        axes={"predictor": ("simulator", "kinematic")},
     ),
 }
 

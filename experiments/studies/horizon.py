@@ -57,7 +57,9 @@ def measure_horizon(command: Horizon) -> None:
     def look(key: jax.Array, learner: Learner) -> Any:
         layers = functions.algorithm.policy(learner.algorithm)
         mean, scale = env.spec.observation_mean, env.spec.observation_scale
-        policy = SavedPolicy(layers, "relu", "tanh", mean, scale)
+        policy = SavedPolicy(
+            weights=layers, activation="relu", output="tanh", obs_mean=mean, obs_scale=scale
+        )
         return profile(key, lambda observation: experts.act(policy, observation), learner.hparams)
 
     rows, stops = [], config.total_steps // every

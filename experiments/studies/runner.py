@@ -83,7 +83,7 @@ def plan(command: Sweep) -> list[Run]:
                     settings = _settings(command, env, algorithm, chosen, seed=seed)
                     if settings is not None:
                         name = run_name(env, algorithm, chosen, seed)
-                        runs.append(Run(name, tuple(chosen.items()), settings))
+                        runs.append(Run(name=name, values=tuple(chosen.items()), settings=settings))
     return widen(runs)
 
 

@@ -63,7 +63,7 @@ def tune(command: Tune) -> None:
                     evaluate_on="training",
                 )
                 label = run_name(command.env, name, point, seed)
-                runs.append(Run(label, tuple(point.items()), settings))
+                runs.append(Run(name=label, values=tuple(point.items()), settings=settings))
     execute(runs, command.out, Execution(processes=command.processes))
     found = read_points(command.out / RESULTS)
     table = [_row(found, name, point) for name in names for point in points(name)]

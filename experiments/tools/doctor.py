@@ -58,18 +58,26 @@ def _installed(module: str) -> bool:
 
 
 PIECES = (
-    Piece("render", "pictures, GIFs and MP4 films", ("PIL", "av")),
-    Piece("plot", "figures", ("matplotlib",)),
-    Piece("manipulation", "pictures of the arms, C MuJoCo twin", ("mujoco", "mujoco.mjx")),
-    Piece("brax", "the brax adapter", ("brax",)),
-    Piece("ray", "sweeps on a Ray cluster", ("ray",)),
-    Piece("ui", "a person in the browser", ("starlette", "uvicorn", "websockets", "PIL")),
-    Piece("minari", "sessions as Minari data sets", ("minari", "h5py")),
-    Piece("docs", "building the documentation", ("mkdocs", "mkdocstrings")),
+    Piece(name="render", what="pictures, GIFs and MP4 films", modules=("PIL", "av")),
+    Piece(name="plot", what="figures", modules=("matplotlib",)),
     Piece(
-        "dev",
-        "tests, static checks and notebooks",
-        (
+        name="manipulation",
+        what="pictures of the arms, C MuJoCo twin",
+        modules=("mujoco", "mujoco.mjx"),
+    ),
+    Piece(name="brax", what="the brax adapter", modules=("brax",)),
+    Piece(name="ray", what="sweeps on a Ray cluster", modules=("ray",)),
+    Piece(
+        name="ui",
+        what="a person in the browser",
+        modules=("starlette", "uvicorn", "websockets", "PIL"),
+    ),
+    Piece(name="minari", what="sessions as Minari data sets", modules=("minari", "h5py")),
+    Piece(name="docs", what="building the documentation", modules=("mkdocs", "mkdocstrings")),
+    Piece(
+        name="dev",
+        what="tests, static checks and notebooks",
+        modules=(
             "pytest",
             "xdist",
             "pytest_timeout",
@@ -82,7 +90,13 @@ PIECES = (
             "ruff",
         ),
     ),
-    Piece("chromium", "tests in the browser", (), BROWSERS, "apt-get install -y chromium"),
+    Piece(
+        name="chromium",
+        what="tests in the browser",
+        modules=(),
+        programs=BROWSERS,
+        command="apt-get install -y chromium",
+    ),
 )
 
 

@@ -256,7 +256,9 @@ def _paint(pipe: Any, name: str) -> None:
             number, state, shown = pipe.recv()
             while pipe.poll():
                 number, state, shown = pipe.recv()
-            pixels = scene.draw(state, ArmPaths(shown.novice, shown.fails, shown.mine))
+            pixels = scene.draw(
+                state, ArmPaths(novice=shown.novice, takeover=shown.fails, expert=shown.mine)
+            )
             out = io.BytesIO()
             Image.fromarray(pixels).save(out, "JPEG", quality=80)
             pipe.send((number, out.getvalue()))

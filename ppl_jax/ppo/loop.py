@@ -380,7 +380,12 @@ def saved(problem: Problem, learner: PPOLearner) -> SavedPolicy:
     network = learner.learned.policy.average
     mean, scale = centre_and_scale(problem, learner.learned.inputs)
     return SavedPolicy(
-        layers(network["mean"]), "relu", "tanh", mean, scale, log_std=network["log_std"]
+        weights=layers(network["mean"]),
+        activation="relu",
+        output="tanh",
+        obs_mean=mean,
+        obs_scale=scale,
+        log_std=network["log_std"],
     )
 
 

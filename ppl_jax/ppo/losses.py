@@ -103,9 +103,9 @@ class RunningStats:
         square = jnp.sum((values - mean) ** 2, 0)
         total, away = self.count + count, mean - self.mean
         return RunningStats(
-            total,
-            self.mean + away * (count / total),
-            self.square + square + away**2 * (self.count / total * count),
+            count=total,
+            mean=self.mean + away * (count / total),
+            square=self.square + square + away**2 * (self.count / total * count),
         )
 
     @property
@@ -116,7 +116,7 @@ class RunningStats:
 
 def init_running_stats(shape: tuple[int, ...]) -> RunningStats:
     """Empty running statistics."""
-    return RunningStats(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
+    return RunningStats(count=jnp.zeros(()), mean=jnp.zeros(shape), square=jnp.zeros(shape))
 
 
 @flax.struct.dataclass

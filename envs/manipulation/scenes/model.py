@@ -59,19 +59,61 @@ class Link(NamedTuple):
 
 
 LINKS = (
-    Link("shoulder", (0.0, 0.0, 0.163), False, "z", 3.7, (0.0, 0.0, 0.0),
-         (0.0102675, 0.0102675, 0.00666)),
-    Link("upper_arm", (0.0, 0.138, 0.0), True, "y", 8.393, (0.0, 0.0, 0.2125),
-         (0.133886, 0.133886, 0.0151074)),
-    Link("forearm", (0.0, -0.131, 0.425), False, "y", 2.275, (0.0, 0.0, 0.196),
-         (0.0311796, 0.0311796, 0.004095)),
-    Link("wrist_1", (0.0, 0.0, 0.392), True, "y", 1.219, (0.0, 0.127, 0.0),
-         (0.0025599, 0.0025599, 0.0021942)),
-    Link("wrist_2", (0.0, 0.127, 0.0), False, "z", 1.219, (0.0, 0.0, 0.1),
-         (0.0025599, 0.0025599, 0.0021942)),
-    Link("wrist_3", (0.0, 0.0, 0.1), False, "y", 0.1889, (0.0, 0.0771683, 0.0),
-         (9.90863e-5, 1.32134e-4, 9.90863e-5)),
-)  # fmt: skip
+    Link(
+        name="shoulder",
+        position=(0.0, 0.0, 0.163),
+        turned=False,
+        axis="z",
+        mass=3.7,
+        centre=(0.0, 0.0, 0.0),
+        inertia=(0.0102675, 0.0102675, 0.00666),
+    ),
+    Link(
+        name="upper_arm",
+        position=(0.0, 0.138, 0.0),
+        turned=True,
+        axis="y",
+        mass=8.393,
+        centre=(0.0, 0.0, 0.2125),
+        inertia=(0.133886, 0.133886, 0.0151074),
+    ),
+    Link(
+        name="forearm",
+        position=(0.0, -0.131, 0.425),
+        turned=False,
+        axis="y",
+        mass=2.275,
+        centre=(0.0, 0.0, 0.196),
+        inertia=(0.0311796, 0.0311796, 0.004095),
+    ),
+    Link(
+        name="wrist_1",
+        position=(0.0, 0.0, 0.392),
+        turned=True,
+        axis="y",
+        mass=1.219,
+        centre=(0.0, 0.127, 0.0),
+        inertia=(0.0025599, 0.0025599, 0.0021942),
+    ),
+    Link(
+        name="wrist_2",
+        position=(0.0, 0.127, 0.0),
+        turned=False,
+        axis="z",
+        mass=1.219,
+        centre=(0.0, 0.0, 0.1),
+        inertia=(0.0025599, 0.0025599, 0.0021942),
+    ),
+    Link(
+        name="wrist_3",
+        position=(0.0, 0.0, 0.1),
+        turned=False,
+        axis="y",
+        mass=0.1889,
+        centre=(0.0, 0.0771683, 0.0),
+        inertia=(9.90863e-5, 1.32134e-4, 9.90863e-5),
+    ),
+)
 HAND = (0.0, 0.098, 0.0)  # of the hand's frame in wrist 3's; turned by -90 degrees about x
 ARMATURE = tuple(5.0 / (index + 1) for index in range(6))
 DAMPING = 0.001  # N m s, every arm joint
@@ -95,8 +137,10 @@ class Tool(NamedTuple):
     box: float
 
 
-WIPER = Tool(0.03, 0.015, (0.01, 0.01, 0.01), 0.03, 2**0.5)
-GRIPPER = Tool(0.1579, 0.0886, (0.00137, 0.00137, 0.00105), 0.145, 0.775)
+WIPER = Tool(mass=0.03, centre=0.015, inertia=(0.01, 0.01, 0.01), grip=0.03, box=2**0.5)
+GRIPPER = Tool(
+    mass=0.1579, centre=0.0886, inertia=(0.00137, 0.00137, 0.00105), grip=0.145, box=0.775
+)
 AIR_DENSITY, AIR_VISCOSITY = 1.2, 2e-5  # kg/m^3, Pa s
 
 _ARM_COLOUR, _JOINT_COLOUR, _STEEL = ".93 .93 .95 1", ".35 .60 .85 1", ".30 .32 .36 1"
@@ -200,7 +244,7 @@ def _inertial(tool: Tool) -> str:
     )
 
 
-def _pair(name: str, first: str, second: str, friction: float, soft: str) -> str:
+def _pair(name: str, first: str, second: str, *, friction: float, soft: str) -> str:
     return (
         f'<pair name="{name}" geom1="{first}" geom2="{second}" condim="3" '
         f'friction="{friction} {friction} 0 0 0" {soft}/>'
@@ -249,7 +293,8 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
 <geom class="shown" type="box" pos="0 0 .004" size=".03 .03 .012" rgba="{_STEEL}"/>
 <geom class="shown" type="box" pos="0 0 .0225" size=".03 .06 .0075" rgba=".95 .75 .25 1"/>"""
     pairs = "".join(
-        _pair(f"press_{i}", "table", f"point_{i}", friction, soft) for i in range(len(points))
+        _pair(f"press_{i}", "table", f"point_{i}", friction=friction, soft=soft)
+        for i in range(len(points))
     )
     spots = "".join(
         f'<body name="marker_{i}" mocap="true"><geom class="shown" type="cylinder" '
@@ -317,19 +362,21 @@ def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, fric
 <geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
   rgba=".6 .62 .65 1"/>"""
     pairs = "".join(
-        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction, soft)
+        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction=friction, soft=soft)
         for side in ("left", "right")
         for i in range(pads)
     )
     pairs += "".join(
-        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction, soft)
+        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction=friction, soft=soft)
         for side in ("left", "right")
         for i in (0, pads // 2)
     )
     pairs += "".join(
-        _pair(f"foot_{i}", "table", f"foot_{i}", friction, soft) for i in range(len(feet))
+        _pair(f"foot_{i}", "table", f"foot_{i}", friction=friction, soft=soft)
+        for i in range(len(feet))
     )
     pairs += "".join(
-        _pair(f"bead_{i}", f"bead_{i}", "peg", friction, soft) for i in range(len(beads))
+        _pair(f"bead_{i}", f"bead_{i}", "peg", friction=friction, soft=soft)
+        for i in range(len(beads))
     )
     return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)

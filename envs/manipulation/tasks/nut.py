@@ -149,7 +149,12 @@ def _advance(state: NutState, action: jax.Array) -> NutState:
         motion = operational_space.free_motion(
             list(s.joints), list(s.speeds), goal=goal, tool=GRIPPER, weight=weight
         )
-        ring = Ring(s.position - BASE, rotation_matrix(s.quaternion), s.velocity, s.spin)
+        ring = Ring(
+            position=s.position - BASE,
+            rotation=rotation_matrix(s.quaternion),
+            velocity=s.velocity,
+            spin=s.spin,
+        )
         knuckles, inner = s.fingers[::3], s.fingers[1::3]
         result = hold(
             motion,

@@ -142,7 +142,13 @@ def frames(joints: list[Scalar], tool: Tool) -> Frames:
     hand: Matrix = (x, scale(-1.0, z), y)
     links.append((position, hand))
     site: Matrix = (scale(-1.0, hand[1]), hand[0], hand[2])
-    return Frames(axes, anchors, links, add(position, scale(tool.grip, hand[2])), site)
+    return Frames(
+        axes=axes,
+        anchors=anchors,
+        links=links,
+        position=add(position, scale(tool.grip, hand[2])),
+        rotation=site,
+    )
 
 
 def jacobian(at: Frames) -> list[tuple[Vector, Vector]]:

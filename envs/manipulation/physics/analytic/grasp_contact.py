@@ -129,14 +129,22 @@ def on_handle(pads: jax.Array, ring: Ring) -> _Points:
     reach = (jnp.abs(local[:, 0]) < HANDLE_HALF[0]) & (jnp.abs(local[:, 2]) < HANDLE_HALF[2])
     gap = jnp.where(reach & (gap > -_DEEPEST), gap, 1.0)
     normal = side[:, None] * ring.rotation[:, 1]
-    return _Points(gap, pads, normal, jnp.broadcast_to(ring.rotation[:, 0], normal.shape))
+    return _Points(
+        gap=gap,
+        place=pads,
+        normal=normal,
+        tangent=jnp.broadcast_to(ring.rotation[:, 0], normal.shape),
+    )
 
 
 def _upward(place: jax.Array) -> _Points:
     up, east = jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
     shape = place.shape
     return _Points(
-        place[:, 2] - _TABLE, place, jnp.broadcast_to(up, shape), jnp.broadcast_to(east, shape)
+        gap=place[:, 2] - _TABLE,
+        place=place,
+        normal=jnp.broadcast_to(up, shape),
+        tangent=jnp.broadcast_to(east, shape),
     )
 
 
@@ -155,12 +163,13 @@ def _around_peg(beads: jax.Array) -> _Points:
     upward = jnp.where(outside, above / distance, 0.0)
     normal = jnp.concatenate([level[:, None] * out, upward[:, None]], -1)
     tangent = jnp.concatenate([-out[:, 1:], out[:, :1], jnp.zeros_like(upward)[:, None]], -1)
-    return _Points(gap, beads - RING_BEAD * normal, normal, tangent)
+    return _Points(gap=gap, place=beads - RING_BEAD * normal, normal=normal, tangent=tangent)
 
 
 def hold(
     motion: Motion,
     ring: Ring,
+    *,
     fingers: jax.Array,
     finger_speeds: jax.Array,
     inner: jax.Array,
@@ -250,7 +259,7 @@ def hold(
     force = cone_force(rows @ a + rest, weight, FRICTION)
     squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
     touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
-    return Held(a, jnp.sum(squeeze, -1), touching)
+    return Held(acceleration=a, squeeze=jnp.sum(squeeze, -1), touching=touching)
 
 
 def _newton(
