@@ -84,7 +84,8 @@ class Recording:
         """
         start = np.asarray(self.scenario.objects.box_pose)
         poses = np.repeat(start[None], steps + 1, 0)
-        ends = [entry.get("pose_end") for entry in objects if "radius" not in entry]
+        # cones and warnings are round; the radius of a barrier, a box, is recorded as 0
+        ends = [entry.get("pose_end") for entry in objects if not entry.get("radius")]
         for i, end in enumerate(ends):
             if end is None or np.hypot(*(np.array(end[:2]) - start[i, :2])) < 0.02:
                 continue
