@@ -43,6 +43,11 @@ from experiments.options.commands import (
 from ppl_jax import __version__
 
 HELP_ALL = "--help-all"
+_ABOUT = (
+    "Predictive preference learning from human interventions: train, compare, sweep, draw, take "
+    "over. `ppl COMMAND --help` explains a command, `ppl list` names what they take, "
+    "`ppl --version` says the version."
+)
 _PLAIN = {
     "evaluate": Evaluate,
     "compare": Compare,
@@ -98,7 +103,7 @@ def parse(argv: Sequence[str]) -> Any:
     union: Any = kinds[0]
     for kind in kinds[1:]:
         union = union | kind
-    parsed = tyro.cli(union, prog="ppl", args=words, description=__doc__)
+    parsed = tyro.cli(union, prog="ppl", args=words, description=_ABOUT)
     if isinstance(parsed, Play):
         parsed.words = tuple(words)
     return finish(parsed)

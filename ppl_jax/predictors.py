@@ -109,7 +109,7 @@ class Predictor(NamedTuple):
     hparams: type = NoHParams
 
 
-def _environments_own(name: str) -> Callable[[Env], Callable[..., tuple[Any, Outcome]]]:
+def _environments_own(name: str, about: str) -> Callable[[Env], Callable[..., tuple[Any, Outcome]]]:
     """A predictor that the environment brings: `env.predictors[name]`."""
 
     def make(env: Env) -> Callable[..., tuple[Any, Outcome]]:
@@ -128,6 +128,7 @@ def _environments_own(name: str) -> Callable[[Env], Callable[..., tuple[Any, Out
 
         return predicted
 
+    make.__doc__ = about
     return make
 
 
@@ -158,8 +159,10 @@ def register_predictor(
     _PREDICTORS[name] = Predictor(make, hparams)
 
 
-register_predictor("simulator", _environments_own("simulator"))
-register_predictor("kinematic", _environments_own("kinematic"))
+register_predictor("simulator", _environments_own("simulator", "The environment's own transition."))
+register_predictor(
+    "kinematic", _environments_own("kinematic", "Driving: the car alone, without traffic.")
+)
 
 
 def registered_predictors() -> tuple[str, ...]:

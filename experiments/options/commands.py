@@ -8,9 +8,11 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, OmitSubcommandPrefixes, Positional, Suppress, arg, subcommand
 
+from experiments.options.hints import hide_unset
 from experiments.options.seeds import Seeds
 
 
+@hide_unset
 @dataclasses.dataclass
 class Evaluate:
     """Play every held-out scenario once with a trained policy."""
@@ -23,6 +25,7 @@ class Evaluate:
     """Write one row per scenario to this CSV file."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Compare:
     """Train all methods with the same seeds; one table."""
@@ -61,6 +64,7 @@ class Compare:
     """Folder of the runs and result files; finished runs in it are kept."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Ablation:
     """Train the ten rows of the paper's ablation with the same seeds; one table."""
@@ -87,6 +91,7 @@ class Ablation:
     """Folder of the runs and result files; finished runs in it are kept."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Tune:
     """Try the declared grid of every method, on training scenarios; one table."""
@@ -113,6 +118,7 @@ class Tune:
     """Folder of the runs and of tuning.csv; finished runs in it are kept."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class ExpertTrain:
     """Train a neural expert by PPO-Lagrangian: progress, then its evaluation; a run folder."""
@@ -120,6 +126,7 @@ class ExpertTrain:
     # its options are generated when it is asked for: see `experiments.options.expert`
 
 
+@hide_unset
 @dataclasses.dataclass
 class ExpertEvaluate:
     """Play every held-out scenario once with an expert."""
@@ -134,6 +141,7 @@ class ExpertEvaluate:
     """Write one row per scenario to this CSV file."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class ExpertCard:
     """Write a trained expert's policy, its curve and a card that says how it was made."""
@@ -146,6 +154,7 @@ class ExpertCard:
     """Replace the files of an earlier card in --out."""
 
 
+@hide_unset
 @dataclasses.dataclass(frozen=True)
 class Sweep:
     """Train every combination of settings with every seed; resumes.
@@ -190,6 +199,7 @@ class Sweep:
     """Folder of the result files; finished runs in it are kept."""
 
 
+@hide_unset
 @dataclasses.dataclass(frozen=True)
 class Robustness(Sweep):
     """Train under noise on predicted states (or on the expert's actions); resumes."""
@@ -222,6 +232,7 @@ def expert_command(train: type) -> type:
 Expert = expert_command(ExpertTrain)
 
 
+@hide_unset
 @dataclasses.dataclass
 class Horizon:
     """Measure along runs of ppl what a longer preference horizon buys and costs."""
@@ -242,6 +253,7 @@ class Horizon:
     """File to write."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Table:
     """Print results as a table: Markdown, LaTeX or plain."""
@@ -261,6 +273,7 @@ class Table:
     """Environment of results that do not name theirs (those of ppl compare)."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Figure:
     """Draw results."""
@@ -285,6 +298,7 @@ class Figure:
     """File to write; its ending decides how."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Export:
     """Write a run's policy as one file that plain NumPy can run."""
@@ -295,6 +309,7 @@ class Export:
     """File to write."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Render:
     """Draw one episode of a policy as GIF, MP4 or PNG (the file's ending decides)."""
@@ -311,6 +326,7 @@ class Render:
     """Environment of "scripted" and "neural"."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Play:
     """Train a policy yourself: watch it in a browser and take over when it is about to fail."""
@@ -358,6 +374,7 @@ class Play:
     words: Suppress[tuple[str, ...]] = ()
 
 
+@hide_unset
 @dataclasses.dataclass
 class Replay:
     """Watch a recorded session in a browser."""
@@ -372,6 +389,7 @@ class Replay:
     """Allow a host that others on the network can reach."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Recording:
     """Write a session of `ppl play` as one file that NumPy (or Minari) can read."""
@@ -384,6 +402,7 @@ class Recording:
     """Write a Minari data set of this name instead, such as driving/person-v0."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Bench:
     """Measure speed, as ratios within one run."""
@@ -402,11 +421,13 @@ class Bench:
     """Also write the figures to this JSON file."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class Doctor:
     """Say what this machine has, and what to do about what is missing."""
 
 
+@hide_unset
 @dataclasses.dataclass
 class List:
     """Name the environments, methods, gates, predictors, objectives, studies, presets, experts."""

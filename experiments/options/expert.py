@@ -24,6 +24,7 @@ from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import refuse_contradictions
 from experiments.options.commands import ExpertTrain
+from experiments.options.hints import shown
 from experiments.options.settings import (
     HELP_ALL,
     environments,
@@ -56,11 +57,11 @@ _OWN: dict[str, list[tuple[str, Any, str]]] = {
         (
             "held_out_scenarios",
             str | None,
-            "Folder of recorded scenarios to evaluate on; those of --scenarios.",
+            "Folder of recorded scenarios to evaluate on (default: those of --scenarios).",
         ),
     ],
     "output": [
-        ("out", Path | None, "Run folder; runs/ENV-expert-SEED-TIME."),
+        ("out", Path | None, "Run folder (default: runs/ENV-expert-SEED-TIME)."),
         ("resume", bool, "Continue the run in --out; its settings come from there."),
     ],
 }
@@ -127,9 +128,9 @@ def expert_options(argv: Sequence[str]) -> ExpertOptions:
     refuse_old_names(argv, OLD_NAMES, {})
     before = _before(argv)
     env = before.env if before is not None else next(iter(environments_in(argv)), "")
-    shown = before or new_settings(env)
-    defaults = {"out": None, "resume": False, **values_of(shown)}
-    settings = catalogue(shown.config, shown.hparams)
+    start = before or new_settings(env)
+    defaults = {"out": None, "resume": False, **values_of(start)}
+    settings = catalogue(start.config, start.hparams)
     groups = option_fields(settings, everything=shows_everything(argv), groups=GROUPS)
     hint = f"(default: {env})" if before is not None else "(required)"
     told = tyro.conf.arg(
@@ -148,7 +149,7 @@ def expert_options(argv: Sequence[str]) -> ExpertOptions:
         fields = [
             (
                 name,
-                Annotated[kind, tyro.conf.arg(help=text)],
+                shown(kind, defaults[name], text=text),
                 dataclasses.field(default=defaults[name]),
             )
             for name, kind, text in _OWN.get(group, [])

@@ -174,7 +174,7 @@ def axis_fields(settings: Mapping[str, Setting], *, everything: bool) -> list[An
         kind: Any = str if listed else kind_of(one)
         text = one.about.help + (" Each value is W,W,...." if listed else "")
         shown = ",".join(map(str, one.value)) if listed else one.value
-        told = tyro.conf.arg(help=f"{text} (a run's own: {shown})")
+        told = tyro.conf.arg(help=text, help_behavior_hint=f"(a run's own: {shown})")
         whole: Any = Annotated[tuple[kind, ...], told]
         if not (one.about.common or everything):
             whole = Annotated[tuple[kind, ...], told, tyro.conf.Suppress]

@@ -18,6 +18,7 @@ from experiments.engine.settings import (
     flat,
     run_settings,
 )
+from experiments.options.hints import shown
 from experiments.options.settings import (
     GROUPS,
     HELP_ALL,
@@ -53,16 +54,21 @@ _OWN: dict[str, list[Any]] = {
             "Steps between evaluations and checkpoints; a tenth of the run.",
         ),
         ("evaluate_on", Literal["held_out", "training"], "held_out", "Scenarios that are played."),
-        ("scenarios", str | None, None, "Folder of recorded scenarios to train on."),
+        (
+            "scenarios",
+            str | None,
+            None,
+            "Folder of recorded scenarios to train on (default: generated ones).",
+        ),
         (
             "held_out_scenarios",
             str | None,
             None,
-            "Folder of recorded scenarios to evaluate on; those of --scenarios.",
+            "Folder of recorded scenarios to evaluate on (default: those of --scenarios).",
         ),
     ],
     "output": [
-        ("out", Path | None, None, "Run folder; runs/ENV-ALGORITHM-SEED-TIME."),
+        ("out", Path | None, None, "Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."),
         ("resume", bool, False, "Continue the run in --out; its settings come from there."),
     ],
 }
@@ -102,7 +108,7 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     ]
     for group in GROUPS:
         fields = [
-            (name, Annotated[kind, tyro.conf.arg(help=text)], dataclasses.field(default=own[name]))
+            (name, shown(kind, own[name], text=text), dataclasses.field(default=own[name]))
             for name, kind, _, text in _OWN.get(group, [])
         ] + groups[group]
         if fields:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from envs.registry import registered
 from experiments.studies.grid import STUDIES
 from ppl_jax import algorithms
@@ -9,7 +11,12 @@ from ppl_jax.cards import card
 from ppl_jax.config import PRESETS
 from ppl_jax.gates import gate, registered_gates
 from ppl_jax.losses import OBJECTIVES
-from ppl_jax.predictors import registered_predictors
+from ppl_jax.predictors import predictor, registered_predictors
+
+
+def _first_line(function: Any) -> str:
+    """The first line of a docstring; empty where there is none."""
+    return (function.__doc__ or "").strip().partition("\n")[0]
 
 
 def listing() -> str:
@@ -19,14 +26,17 @@ def listing() -> str:
             f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()
         ]
         + ["brax:NAME        any environment of brax"],
-        "methods": algorithms.registered(),
-        "gates": [
-            f"{name:20} {(gate(name).decide.__doc__ or '').strip().splitlines()[0]}".rstrip()
-            if gate(name).decide.__doc__
-            else name
-            for name in registered_gates()
+        "methods": [
+            f"{name:20} {_first_line(algorithms.method(name).make)}".rstrip()
+            for name in algorithms.registered()
         ],
-        "predictors": list(registered_predictors()),
+        "gates": [
+            f"{name:20} {_first_line(gate(name).decide)}".rstrip() for name in registered_gates()
+        ],
+        "predictors": [
+            f"{name:20} {_first_line(predictor(name).make)}".rstrip()
+            for name in registered_predictors()
+        ],
         "objectives": list(OBJECTIVES),
         "studies": [f"{name:20} {study.title}" for name, study in STUDIES.items()],
         "presets": list(PRESETS),
