@@ -96,6 +96,10 @@ def parse(argv: Sequence[str]) -> Any:
         options = expert_options(words)
         classes["expert"] = expert_command(options.cls)
         finish = lambda parsed: expert_request(parsed.command, options, words)  # noqa: E731
+    elif named == "play":
+        from experiments.options.play import play_options
+
+        classes["play"], finish = play_options(argv[argv.index(named) + 1 :])
     elif named in ("sweep", "robustness"):
         classes[named], finish = _with_axes(classes[named], argv)
     words = ["--help" if word == HELP_ALL else word for word in argv]
@@ -104,8 +108,6 @@ def parse(argv: Sequence[str]) -> Any:
     for kind in kinds[1:]:
         union = union | kind
     parsed = tyro.cli(union, prog="ppl", args=words, description=_ABOUT)
-    if isinstance(parsed, Play):
-        parsed.words = tuple(words)
     return finish(parsed)
 
 
@@ -340,14 +342,13 @@ def _play(command: Play) -> None:
     else:
         if command.env is None:
             raise UserError("env: name the environment, such as driving")
-        names = ("total_steps", "preference_horizon", "beta", "learning_rate")
         settings = run_settings(
             command.env,
             command.algorithm,
             command.seed,
             expert="person",
             scenarios=command.scenarios,
-            given={name: given[name] for name in names if name in given},
+            given=command.settings,
         )
         session_config = new_session(command.env, given)
         out = command.out or new_folder(command.env, command.algorithm, command.seed)

@@ -337,14 +337,6 @@ class Play:
     """Method that learns from you: ppl, pvp, hg_dagger, iwr, eil or haco."""
     seed: int = 0
     """Random seed."""
-    total_steps: int | None = None
-    """Steps of the session."""
-    preference_horizon: int | Literal["auto"] | None = None
-    """L: predicted states that get a preference pair."""
-    beta: float | None = None
-    """Temperature of the preference loss."""
-    learning_rate: float | None = None
-    """Adam's learning rate."""
     manual_episodes: int = 0
     """Number of episodes at the start in which you make every step."""
     participant: str = ""
@@ -371,7 +363,10 @@ class Play:
     """Run folder (default: runs/ENV-ALGORITHM-SEED-TIME)."""
     resume: bool = False
     """Continue the session in --out; its settings come from there."""
-    words: Suppress[tuple[str, ...]] = ()
+    words: Suppress[Fixed[tuple[str, ...]]] = ()
+    """The command line."""
+    settings: Suppress[Fixed[dict[str, Any]]] = dataclasses.field(default_factory=dict)
+    """Settings of the run that it names."""
 
 
 @hide_unset

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-_OF_THE_COMMAND = ("out", "resume", "host", "port", "expose", "words")
+_OF_THE_COMMAND = ("out", "resume", "host", "port", "expose", "words", "settings")
 
 
 def named_options(command: Any, words: Sequence[str]) -> dict[str, Any]:
@@ -16,11 +16,12 @@ def named_options(command: Any, words: Sequence[str]) -> dict[str, Any]:
         words: Words of the command line.
     """
     named = set(_named(words))
-    return {
+    of_session = {
         name: value
         for name, value in vars(command).items()
         if name not in _OF_THE_COMMAND and (name in named or (name == "env" and value is not None))
     }
+    return of_session | command.settings
 
 
 def _named(words: Iterable[str]) -> Iterable[str]:
