@@ -236,7 +236,7 @@ def watch(
     most = config.method.max_preference_horizon
 
     def transition(*args: Any) -> Any:
-        return predicted_transition(*args, hparams.predictor)
+        return predicted_transition(*args, hparams=hparams.predictor)
 
     def step(carry: Any, _: None) -> tuple[Any, Watched]:
         key, observation, state = carry

@@ -217,7 +217,7 @@ def test_bad_policies_are_refused(run, tmp_path):
     assert "w1 holds a NaN" in done.stderr
     np.savez(tmp_path / "small.npz", **(files | {"w0": files["w0"][:100]}))
     done = ppl("evaluate", tmp_path / "small.npz", code=2)
-    assert "maps 100 observations to 2 actions; this world has 259 and 2" in done.stderr
+    assert "maps 100 observations to 2 actions; this environment has 259 and 2" in done.stderr
 
 
 def test_another_config_or_an_occupied_folder_is_refused(run):

@@ -26,7 +26,7 @@ def start(world):
 def test_a_prediction_is_the_transition_in_a_loop_and_leaves_no_trace(world, start, predictor):
     params, action = world.default_params, jnp.array([0.3, 0.5])
     rolled = named(predictor).make(world)
-    transition = lambda *args: rolled(*args, NoHParams())  # noqa: E731
+    transition = lambda *args: rolled(*args, hparams=NoHParams())  # noqa: E731
     before = jax.tree.map(np.array, start)
     predicted = jax.jit(
         lambda s: predict(
