@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-unit test-worlds test-system test-browser check docs clean
+.PHONY: demo test test-unit test-learning test-worlds test-system test-browser check docs clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -16,7 +16,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2
 
-test-unit test-worlds test-system test-browser: test-%: $(VENV)/.installed
+test-unit test-learning test-worlds test-system test-browser: test-%: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 tests/$*
 
 check: $(VENV)/.installed

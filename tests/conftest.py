@@ -10,7 +10,7 @@ set_xla_flags()  # before JAX starts: tests run the programs that users run
 import jax  # noqa: E402
 
 TESTS = Path(__file__).parent
-TIERS = ("unit", "worlds", "system", "browser")
+TIERS = ("unit", "learning", "worlds", "system", "browser")
 CACHE = TESTS.parent / ".pytest_cache" / "xla"
 DATA = TESTS.parent.parent / "shared" / "data"
 RECORDINGS = DATA / "metadrive"

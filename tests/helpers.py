@@ -15,6 +15,7 @@ import numpy as np
 from envs.base import Environment
 from ppl_jax import algorithms, checkpoint, gates, predictors
 from ppl_jax.config import HParams, TrainConfig, replace, values
+from ppl_jax.training import make_train
 from ppl_jax.types import EnvSpec, Outcome
 
 ROOT = Path(__file__).parent.parent
@@ -356,3 +357,15 @@ def call(script, *words, code=0):
     )
     assert done.returncode == code, done.stdout + done.stderr
     return done
+
+
+def pairwise(a, b):
+    """The leaves of two trees in pairs."""
+    return zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+
+
+def functions(name, probe=None, **changes):
+    """A method's training functions in a probe environment, and its settings."""
+    probe = probe or Probe()
+    config, hparams = probe_settings(name, **changes)
+    return make_train(probe, probe.scripted_expert, algorithms.method(name).make, config), hparams

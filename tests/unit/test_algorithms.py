@@ -1,4 +1,4 @@
-"""Every method: its losses by NumPy loops, its data, and what it learns in probe worlds."""
+"""Every method: its losses by NumPy loops, its networks and its data."""
 
 import dataclasses
 import functools
@@ -8,26 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax import algorithms, buffers, checkpoint
+from ppl_jax import buffers
 from ppl_jax.algorithms import eil, gail, haco, ppl, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
 from ppl_jax.config import HParams
-from ppl_jax.evaluation import make_evaluate
 from ppl_jax.experts import SavedPolicy, act
 from ppl_jax.networks import Network, ensemble_layers, make_critic, make_ensemble, make_policy
-from ppl_jax.training import make_train, phases
 from ppl_jax.types import PreferenceBatch
-from tests.helpers import OWN, Balance, Goal, Probe, plain_settings, probe_settings
+from tests.helpers import Probe, plain_settings, probe_settings
 
 RNG = np.random.default_rng(1)
 B, K, A = 6, 2, 3
-NAMES = algorithms.registered()
 HP = HParams(learning_rate=3e-3)
-PROBES = {"gail": Goal}  # it has to see the expert succeed
-
-
-def pairwise(a, b):
-    return zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
 
 
 def uniform(*shape):
@@ -36,20 +28,6 @@ def uniform(*shape):
 
 def coins(*shape):
     return RNG.integers(0, 2, shape).astype(bool)
-
-
-def functions(name, probe=None, **changes):
-    probe = probe or Probe()
-    config, hparams = probe_settings(name, **changes)
-    return make_train(probe, probe.scripted_expert, algorithms.method(name).make, config), hparams
-
-
-def success(probe, fns, learner):
-    spec = probe.spec
-    layers = fns.algorithm.policy(learner.algorithm)
-    policy = SavedPolicy(layers, "relu", "tanh", spec.observation_mean, spec.observation_scale)
-    run = make_evaluate(probe, lambda key, state, observation, params: act(policy, observation))
-    return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
 
 
 # --- losses, by loops ---
@@ -258,68 +236,6 @@ def test_an_ensemble_is_one_network_and_its_members_are_independent():
     assert all(np.abs(members[i] - members[j]).max() > 0.01 for i, j in ((0, 1), (0, 2), (1, 2)))
 
 
-def test_ensembles_have_data_sets_of_their_own():
-    fns, hparams = functions("ensemble_dagger")
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    copies = np.asarray(learner.algorithm.human.copies)  # [C, K]
-    assert copies.mean() == pytest.approx(1.0, abs=0.1)
-    assert copies.var() == pytest.approx(1.0, abs=0.15)  # Poisson
-    assert np.abs(np.corrcoef(copies.T) - np.eye(3)).max() < 0.15
-    # a member that lacks a row is not changed by it: with every copy taken away nothing moves
-    state = learner.algorithm
-    human = dataclasses.replace(state.human, copies=0.0 * state.human.copies.at[:, 1].set(0.0))
-    human = dataclasses.replace(human, copies=human.copies.at[:, 0].set(1.0))
-    fresh = fns.algorithm.init(jax.random.key(1))
-    before = fresh.learned.params
-    after, _ = fns.algorithm.update(
-        dataclasses.replace(fresh, human=human), jax.random.key(2), hparams
-    )
-    for old, new in zip(
-        jax.tree.leaves(before), jax.tree.leaves(after.learned.params), strict=True
-    ):
-        assert np.any(old[0] != new[0])
-        np.testing.assert_array_equal(old[1:], new[1:])
-
-
-def next_observation(observation, action):
-    """The probe world's next observation, by hand."""
-    sign, error, one = observation
-    miss = abs(action[0] - Probe.answer(sign))
-    return [sign, error + miss if miss > Probe.tolerance else 0.0, one]
-
-
-@pytest.mark.parametrize("name", ["pvp", "haco", "thrifty_dagger"])
-def test_next_observations_are_right_at_every_end_of_a_segment(name):
-    fns, hparams = functions(name, total_steps=400)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    if name == "thrifty_dagger":
-        held = [learner.algorithm.steps]
-    else:
-        held = [learner.algorithm.replay.human, learner.algorithm.replay.robot]
-    human = int(learner.counters.human_data)
-    assert [int(b.added) for b in held] in ([400], [human, 400 - human])
-    for buffer in held:
-        count = int(buffer.added)
-        assert count > 20
-        steps = jax.tree.map(lambda leaf, n=count: np.asarray(leaf)[:n], buffer.data)
-        executed = steps.action if name == "thrifty_dagger" else steps.executed_action
-        expected = [
-            next_observation(o, a) for o, a in zip(steps.observation, executed, strict=True)
-        ]
-        np.testing.assert_allclose(steps.next_observation, expected, atol=1e-5)
-        if name != "thrifty_dagger":
-            # masks mean what they say
-            assert (steps.takeover == (buffer is held[0])).all()
-            ours = np.where(steps.takeover[:, None], steps.expert_action, steps.novice_action)
-            np.testing.assert_array_equal(steps.executed_action, ours)
-            np.testing.assert_allclose(
-                steps.expert_action[:, 0], Probe.answer(steps.observation[:, 0]), atol=1e-6
-            )
-    if name != "thrifty_dagger":
-        starts = int(np.sum(held[0].data.takeover_start))
-        assert starts == int(learner.counters.takeovers) > 0
-
-
 def test_eil_judges_the_window_before_an_intervention_bad_and_all_else_good():
     """A made-up run against a plain list: n novice, h expert, e the end of an episode."""
     window = 3
@@ -416,167 +332,3 @@ def test_batches_of_eil_and_thrifty_dagger():
     assert not np.any(thrifty_dagger.sample_steps(state, key, key, 20).success)
     state = dataclasses.replace(state, goals=buffers.add(state.goals, goal, jnp.ones(1, bool)))
     assert int(np.sum(thrifty_dagger.sample_steps(state, key, key, 20).success)) == 2
-
-
-@pytest.mark.parametrize("which", ["preferred", "rejected"])
-def test_random_pairs_are_drawn_once_and_change_nothing_else(which):
-    fns, hparams = functions("ppl", total_steps=200, **{which: "random"})
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    state = learner.algorithm
-    count = int(state.preference_buffer.added)
-    assert 20 < count < 2000
-    pairs = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], state.preference_buffer.data)
-    drawn = np.asarray(state.random_actions)[int(which == "rejected"), :count]
-    np.testing.assert_array_equal(getattr(pairs, f"{which}_action"), drawn)
-    assert -1 <= drawn.min() < -0.8 < 0.8 < drawn.max() <= 1  # uniform on the box
-    if which == "rejected":
-        answer = Probe.answer(pairs.observation[:, 0])
-        np.testing.assert_allclose(pairs.preferred_action[:, 0], answer, atol=1e-6)
-    shown = np.asarray(state.human_buffer.data[1])[: int(state.human_buffer.added), 0]
-    np.testing.assert_allclose(np.abs(shown), 0.6, atol=1e-6)
-
-
-# --- learning ---
-
-
-@functools.cache
-def trained(name):
-    """Two seeds at once."""
-    fns, hparams = functions(name, PROBES.get(name, Probe)())
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    learners, _ = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))(keys, hparams)
-    return fns, hparams, learners
-
-
-def lane(tree, i):
-    return jax.tree.map(lambda leaf: leaf[i], tree)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_probe_world_is_solved(name):
-    fns, _, learners = trained(name)
-    assert not np.any(learners.diverged)
-    for i in range(2):
-        assert success(PROBES.get(name, Probe)(), fns, lane(learners, i)) == 1.0
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_human_data_is_counted_exactly(name):
-    _, _, learners = trained(name)
-    config, _ = probe_settings(name)
-    for i in range(2):
-        learner = lane(learners, i)
-        human = int(learner.counters.human_data)
-        assert int(learner.counters.steps) == config.total_steps
-        assert human >= config.demonstrations
-        if name in ("bc", "gail"):
-            assert human == config.demonstrations  # nobody takes over
-        else:
-            assert 0 < human < config.total_steps
-        state = learner.algorithm
-        held = {
-            "human_buffer": lambda state: state.human_buffer,
-            "human": lambda state: state.human.buffer,
-            "steps": lambda state: state.steps.human,
-            "replay": lambda state: state.replay.human,
-        }
-        field = next(f for f in held if hasattr(state, f))
-        assert int(held[field](state).added) == human
-
-
-@pytest.mark.parametrize("name", algorithms.registered(variants=False))
-def test_a_vmapped_lane_is_the_run_alone_in_chunks_saved_and_restored(name, tmp_path):
-    """One lane of two seeds and learning rates, against the same run in pieces on its own."""
-    changes = {"total_steps": 40, "rollout_steps": 20, "batch_size": 8}
-    changes |= {"demonstrations": 20, "offline_updates": 10} if name in OWN else {}
-    fns, hparams = functions(name, **changes)
-    config, _ = probe_settings(name, **changes)
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    rates = jnp.array([3e-3, 1e-3])
-    together, _ = jax.jit(
-        jax.vmap(lambda key, rate: fns.train(key, hparams.replace(learning_rate=rate)))
-    )(keys, rates)
-    pieces = jax.jit(fns.init)(keys[1], hparams.replace(learning_rate=1e-3))
-    chunk = jax.jit(fns.run_chunk, static_argnums=(1, 2))
-    for phase, length in phases(config):
-        for _ in range(length // 20 or 1):
-            pieces, _ = chunk(pieces, min(length, 20) // config.decision_interval, phase)
-            checkpoint.save(tmp_path, 1, pieces)
-            pieces = checkpoint.restore(tmp_path, pieces, lambda line: None)[1]
-    for a, b in pairwise(pieces, lane(together, 1)):
-        if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
-            # where a gradient vanishes, Adam makes whole steps of what rounding leaves of it
-            np.testing.assert_allclose(a, b, atol=2 * 1e-3, rtol=1e-3)
-            assert np.mean(np.abs(np.float64(a) - np.float64(b)) > 3e-4) < 0.02
-
-
-# --- what theory says must fail ---
-
-WATCHED = [
-    name for name in NAMES if name not in ("bc", "gail", "ensemble_dagger", "thrifty_dagger", "iwr")
-]
-
-
-@pytest.mark.parametrize("name", WATCHED)
-def test_nothing_is_learnt_where_nobody_intervenes(name):
-    probe = Probe()
-    config, hparams = probe_settings(name, min_speed=0.0, total_steps=100)
-    watched = algorithms.method(name).make
-
-    def careless(spec, config):
-        never = lambda state, point, hparams: jnp.zeros((), bool)  # noqa: E731
-        return watched(spec, config)._replace(decide=never)
-
-    fns = make_train(probe, probe.scripted_expert, careless, config)
-    start = jax.jit(fns.init)(jax.random.key(0), hparams)
-    end, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 10)
-    assert int(end.counters.human_data) == 0
-    for a, b in pairwise(start.algorithm.learned, end.algorithm.learned):
-        np.testing.assert_array_equal(a, b)
-
-
-FAILS = {
-    # a single member never disagrees with itself: without the discrepancy test it never asks
-    "an ensemble of one": ("ensemble_dagger", {"members": 1, "max_discrepancy": 1e9}),
-    # preferring noise to the novice's action says nothing about the expert's
-    "ppl with random preferred actions alone": ("ppl", {"preferred": "random", "bc_weight": 0.0}),
-}
-
-
-@pytest.mark.parametrize("case", FAILS)
-def test_a_variant_fails_where_theory_says_so(case):
-    name, changes = FAILS[case]
-    changes = dict(changes)
-    if name == "ensemble_dagger":  # demonstrations of one kind of episode only
-        changes |= {"demonstrations": 5, "offline_updates": 20}
-    fns, hparams = functions(name, **changes)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    assert success(Probe(), fns, learner) < 1.0
-    if name == "ensemble_dagger":
-        assert int(learner.counters.human_data) == 5  # it never asked
-
-
-def test_demonstrations_do_not_teach_to_come_back_and_interventions_do():
-    """Covariate shift: in its own episodes the expert never strays.
-
-    Half of the clones extrapolate well enough by chance, so a single seed says nothing.
-    """
-    results = {}
-    for name in ("bc", "hg_dagger"):
-        probe = Balance()
-        fns, hparams = functions(name, probe)
-        train = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))
-        learners, _ = train(jax.random.split(jax.random.key(0), 20), hparams)
-        each = [jax.tree.map(lambda leaf, i=i: leaf[i], learners) for i in range(20)]
-        results[name] = np.mean([success(probe, fns, learner) for learner in each])
-    assert results["bc"] <= 0.8
-    assert results["hg_dagger"] >= 0.95
-
-
-@pytest.mark.parametrize(("correction", "solves"), [(1.0, True), (0.0, False)])
-def test_a_reward_that_is_never_negative_makes_gail_loiter(correction, solves):
-    """Where success ends the episode, -log(1 - D) >= 0 pays for not getting there."""
-    probe = Goal()
-    fns, hparams = functions("gail", probe, survival_correction=correction)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    assert (success(probe, fns, learner) > 0.9) is solves
