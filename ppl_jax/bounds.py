@@ -86,12 +86,30 @@ def _check(mdp: TabularMDP, *policies: jax.Array) -> None:
     chex.assert_shape(policies, (states, actions))
 
 
+def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """x of matrix x = right, matrix [S, S], right [S], by Gauss-Jordan elimination.
+
+    I - gamma P and its transpose are diagonally dominant by rows or columns, so no pivoting is
+    needed. `jnp.linalg.solve` would do the same by LAPACK, which XLA's CPU backend calls on the
+    threads that it computes on: under a `vmap` over thousands of problems, a machine with few cores
+    can wait for itself without end.
+    """
+    chex.assert_shape(matrix, (right.shape[0], right.shape[0]))
+
+    def eliminate(k: jax.Array | int, rows: jax.Array) -> jax.Array:
+        pivot = rows[k] / rows[k, k]
+        return (rows - jnp.outer(rows[:, k], pivot)).at[k].set(pivot)
+
+    rows = jnp.concatenate([matrix, right[:, None]], -1)
+    return jax.lax.fori_loop(0, right.shape[0], eliminate, rows)[:, -1]
+
+
 def action_values(mdp: TabularMDP, policy: jax.Array) -> jax.Array:
     """Q of a policy [S, A]: Q = r + gamma P V, V = sum_a pi Q, [S, A]."""
     _check(mdp, policy)
     moves = jnp.einsum("sa,sat->st", policy, mdp.transition)
     paid = jnp.sum(policy * mdp.reward, -1)
-    value = jnp.linalg.solve(jnp.eye(paid.shape[0]) - mdp.discount * moves, paid)
+    value = _solve(jnp.eye(paid.shape[0]) - mdp.discount * moves, paid)
     return mdp.reward + mdp.discount * mdp.transition @ value
 
 
@@ -100,7 +118,7 @@ def occupancy(mdp: TabularMDP, policy: jax.Array) -> jax.Array:
     _check(mdp, policy)
     moves = jnp.einsum("sa,sat->st", policy, mdp.transition)
     matrix = jnp.eye(moves.shape[0]) - mdp.discount * moves.T
-    return (1 - mdp.discount) * jnp.linalg.solve(matrix, mdp.start)
+    return (1 - mdp.discount) * _solve(matrix, mdp.start)
 
 
 def preference_pairs(
