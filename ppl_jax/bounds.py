@@ -87,7 +87,7 @@ def _check(mdp: TabularMDP, *policies: jax.Array) -> None:
 
 
 def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """x of matrix x = right, matrix [S, S], right [S], by Gauss-Jordan elimination.
+    """The solution x [S] of matrix x = right, matrix [S, S], by Gauss-Jordan elimination.
 
     I - gamma P and its transpose are diagonally dominant by rows or columns, so no pivoting is
     needed. `jnp.linalg.solve` would do the same by LAPACK, which XLA's CPU backend calls on the

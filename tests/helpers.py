@@ -300,12 +300,11 @@ def plain_settings(name, **changes):
     return replace(config, hparams, **changes)
 
 
-def tiny_settings(name, **changes):
-    """The same, tiny."""
+def tiny_settings(name, tiny=TINY, **changes):
+    """The same with what the method has of `tiny`."""
     config, hparams = plain_settings(name, **{k: changes[k] for k in changes if k == "gate"})
     known = values(config, hparams)
-    tiny = {k: v for k, v in TINY.items() if k in known}
-    return plain_settings(name, **(tiny | changes))
+    return plain_settings(name, **({k: v for k, v in tiny.items() if k in known} | changes))
 
 
 def probe_settings(name, **changes):

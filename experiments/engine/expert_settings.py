@@ -11,7 +11,7 @@ import numpy as np
 from envs.registry import known, unknown
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import MAX_SEED, SCHEMA
+from experiments.engine.settings import MAX_SEED, SCHEMA, schema_of
 from ppl_jax.cards import card
 from ppl_jax.ppo.config import PPOConfig, PPOHParams, catalogue, read, replace, validate
 
@@ -54,12 +54,7 @@ class ExpertSettings:
         Raises:
             UserError: If it is of a newer version, or holds what no version has.
         """
-        schema = content.get("schema", 1)
-        if schema > SCHEMA:
-            raise UserError(
-                f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
-                "written by a newer ppl-jax"
-            )
+        schema = schema_of(content)
         try:
             found = content["config"] | content["hparams"] if schema == 1 else content["settings"]
             config, hparams = read(found)

@@ -67,12 +67,7 @@ class RunSettings:
         Raises:
             UserError: If it is of a newer version, or holds what no version has.
         """
-        schema = content.get("schema", 1)
-        if schema > SCHEMA:
-            raise UserError(
-                f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
-                "written by a newer ppl-jax"
-            )
+        schema = schema_of(content)
         try:
             given = {name: content[name] for name in _PLAIN}
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
@@ -87,6 +82,21 @@ _PLAIN = tuple(
     for field in dataclasses.fields(RunSettings)
     if field.name not in ("config", "hparams")
 )
+
+
+def schema_of(content: Mapping[str, Any]) -> int:
+    """The schema version of a config.json; the first wrote none.
+
+    Raises:
+        UserError: If it is a later one than this version knows.
+    """
+    schema = content.get("schema", 1)
+    if schema > SCHEMA:
+        raise UserError(
+            f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
+            "written by a newer ppl-jax"
+        )
+    return schema
 
 
 def flat(config: TrainConfig, hparams: HParams) -> dict[str, Any]:

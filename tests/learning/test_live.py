@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ppl_jax import algorithms
-from ppl_jax.config import values
 from ppl_jax.live import make_live
-from tests.helpers import Probe, plain_settings
+from tests.helpers import Probe, tiny_settings
 
 SMALL = {
     "total_steps": 200,
@@ -24,8 +23,7 @@ SMALL = {
 
 
 def small(algorithm="ppl", **changes):
-    known = values(*plain_settings(algorithm))
-    return plain_settings(algorithm, **({k: SMALL[k] for k in SMALL if k in known} | changes))
+    return tiny_settings(algorithm, SMALL, **changes)
 
 
 CONFIG, HP = small()

@@ -8,10 +8,10 @@ import pytest
 
 from ppl_jax import algorithms, experts
 from ppl_jax.algorithms.ppl import make_ppl
-from ppl_jax.config import replace, validate, values
+from ppl_jax.config import replace, validate
 from ppl_jax.evaluation import make_evaluate
 from ppl_jax.training import make_train
-from tests.helpers import Probe, plain_settings
+from tests.helpers import Probe, tiny_settings
 
 SMALL = {
     "total_steps": 600,
@@ -27,8 +27,7 @@ SMALL = {
 
 
 def small(algorithm="ppl", **changes):
-    known = values(*plain_settings(algorithm))
-    return plain_settings(algorithm, **({k: SMALL[k] for k in SMALL if k in known} | changes))
+    return tiny_settings(algorithm, SMALL, **changes)
 
 
 def set_to(hparams, **changes):
