@@ -60,7 +60,7 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     if "envs" in parts:
         figures |= _environment(env, repeats) | _lookahead(env, repeats)
         for name in ("table_wiping", "nut_assembly"):
-            figures |= _arm(name, repeats)
+            figures |= arm_figures(name, repeats)
     if "training" in parts:
         figures |= _training(env, repeats)
         figures |= _gradient(env, repeats, figures["train_ms_per_step"])
@@ -139,7 +139,9 @@ def _lookahead(env: Any, repeats: int) -> dict[str, float]:
     return {"predicted_steps_per_s": horizon * calls / _median_s(lambda: run(state), repeats)}
 
 
-def _arm(name: str, repeats: int) -> dict[str, float]:
+def arm_figures(
+    name: str, repeats: int, batches: tuple[int, ...] = (1, 16, 64, 256)
+) -> dict[str, float]:
     """Control steps per second of an arm, its lookahead, compile time, and C MuJoCo's rate.
 
     The expert is at the controls until the tool is in contact; its last action is held from there.
@@ -163,7 +165,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
 
     start = env.reset_to(jnp.int32(0), key, params)
     state, actions = jax.jit(approach)(start)
-    for count in (1, 16, 64, 256):
+    for count in batches:
         many = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), state)
         began = time.perf_counter()
         given = state if count == 1 else many
@@ -181,6 +183,7 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
     )
     figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
     try:
+        from envs.manipulation.control.on_mujoco_c import begin, torque
         from envs.manipulation.twins import make_twin
 
         twin = make_twin(env)
@@ -188,12 +191,12 @@ def _arm(name: str, repeats: int) -> dict[str, float]:
         return figures
     twin.place(state)
     arm = twin.arm
-    _, hold = arm.begin(np.zeros(6), state.goal_rotation)
+    _, hold = begin(arm, np.zeros(6), state.goal_rotation)
 
     def c_mujoco() -> None:
         for _ in range(SUBSTEPS * 10):
             arm.mujoco.mj_step1(arm.model, arm.data)
-            arm.data.qfrc_applied[:6] = arm.torque(hold)
+            arm.data.qfrc_applied[:6] = torque(arm, hold)
             arm.mujoco.mj_step2(arm.model, arm.data)
 
     figures[f"{name}_c_mujoco_steps_per_s"] = 10 / _median_s(c_mujoco, repeats)

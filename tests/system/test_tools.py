@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.tools import doctor
+from experiments.tools import bench, doctor
 
 ROOT = Path(__file__).parent.parent.parent
 LOG = "TF_CPP_MIN_LOG_LEVEL"
@@ -84,3 +84,15 @@ def test_the_extras_that_doctor_knows_are_those_that_can_be_installed():
 
 def test_a_piece_that_is_there_is_ready():
     assert doctor.Piece("x", "reading JSON", ("json",)).line().endswith("reading JSON: ready")
+
+
+def test_the_bench_measures_an_arm_and_its_twin():
+    figures = bench.arm_figures("table_wiping", 1, batches=(1,))
+    assert figures.keys() == {
+        "table_wiping_compile_s_1",
+        "table_wiping_steps_per_s_1",
+        "table_wiping_lookahead_10_ms",
+        "table_wiping_c_mujoco_steps_per_s",
+        "table_wiping_over_c_mujoco",
+    }
+    assert all(value > 0 for value in figures.values())
