@@ -18,7 +18,7 @@ from ppl_jax.algorithms.haco import HACOHParams, make_haco, make_haco_port
 from ppl_jax.algorithms.hg_dagger import make_hg_dagger
 from ppl_jax.algorithms.iwr import make_iwr
 from ppl_jax.algorithms.ppl import PPLConfig, PPLHParams, fit_horizons, make_ppl
-from ppl_jax.algorithms.pvp import PVPHParams, make_pvp
+from ppl_jax.algorithms.pvp import PVPHParams, make_pvp, make_pvp4real
 from ppl_jax.algorithms.registry import AlgorithmSpec, method, register, registered, settings
 from ppl_jax.algorithms.thrifty_dagger import ThriftyDAggerHParams, make_thrifty_dagger
 from ppl_jax.cards import EnvCard
@@ -169,7 +169,7 @@ register(
 )
 register(
     "pvp4real",
-    make_pvp,
+    make_pvp4real,
     {**_CRITICS, "bc_weight": 1.0},
     {"discount": 0.9},
     hparams=PVPHParams,

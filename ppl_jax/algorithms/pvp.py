@@ -200,3 +200,8 @@ def make_pvp(spec: EnvSpec, config: TrainConfig) -> Algorithm:
         update=functools.partial(update, networks=networks, config=config),
         policy=lambda state: layers(state.learned.actor.average),
     )
+
+
+def make_pvp4real(spec: EnvSpec, config: TrainConfig) -> Algorithm:
+    """PVP as the PVP4Real repository runs it: with a cloning term, `bc_weight` 1."""
+    return make_pvp(spec, config)
