@@ -25,6 +25,7 @@ from envs.manipulation.physics.analytic.arm import (
     scale,
     twist_of,
 )
+from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
     DAMPING,
     FRICTION_LOSS,
@@ -39,6 +40,7 @@ Scalar = Any
 STIFFNESS = 150.0  # 1/s^2, of position and orientation
 DAMPING_RATE = 2.0 * STIFFNESS**0.5  # 1/s: critical
 POSITION_STEP, ROTATION_STEP = 0.05, 0.5  # m and rad, what an action of 1 asks for
+POSTURE = 10.0  # 1/s^2, of an arm of more than six joints towards its rest pose
 _SETTLING = 1e-3  # rad/s, within which friction in the joints builds up
 
 
@@ -83,34 +85,31 @@ def any_nonzero(values: list[Scalar]) -> Scalar:
     return found
 
 
-def free_motion(
-    joints: list[Scalar],
-    speeds: list[Scalar],
+def task_torque(
+    columns: list[tuple[Vector, Vector]],
+    factor: list[list[Scalar]],
     *,
+    site: tuple[Vector, Matrix],
+    twist: tuple[Vector, Vector],
     goal: tuple[Vector, Matrix],
-    tool: Tool,
-    weight: list[Scalar],
-) -> Motion:
-    """Acceleration that the controller gives the arm where nothing touches it.
+    gain: Scalar = 1.0,
+) -> list[Scalar]:
+    """Joint torques that pull the grip site to its goal, gravity and limits left out.
 
-        tau = clip(J' [L_p (k e_p - d v); L_o (k e_o - d w)] + bias, limits)
+        tau = J' [L_p (k e_p - d v); L_o (k e_o - d w)],  d = 2 sqrt(k)
         L_p = (J_p M^-1 J_p')^-1,  L_o = (J_o M^-1 J_o')^-1,  e_o = sum_i R_i x G_i / 2
 
-    Source: robosuite 1.4.1, `controllers/osc.py`, `run_controller`; the null-space term is zero
-    for six joints.
+    Source: robosuite 1.4.1, `controllers/osc.py`, `run_controller` (position and orientation
+    uncoupled).
 
     Args:
-        joints, speeds: rad, rad/s.
-        goal: Position (in the base's frame) and rotation of the grip site.
-        tool: In the hand.
-        weight: `bias_torque` at the start of the control step. It is added and compensated, so
-            that it matters only where a torque limit cuts in.
+        columns: Jacobian of the site, per joint (linear, angular).
+        factor: `unrolled_linalg.cholesky` of the joint-space inertia M.
+        site: Position and rotation (columns) of the site.
+        twist: Its velocity, m/s and rad/s.
+        goal: Position and rotation that it is to have.
+        gain: Factor on the stiffness k; the damping stays critical.
     """
-    at = unrolled_linalg.materialize(frames(joints, tool))
-    columns = jacobian(at)
-    linear, angular = twist_of(columns, speeds)
-    matrix = unrolled_linalg.materialize(mass_matrix(at, tool))
-    factor = unrolled_linalg.materialize(unrolled_linalg.cholesky(matrix))
     halves = unrolled_linalg.materialize(
         [
             unrolled_linalg.forward(factor, [column[part][axis] for column in columns])
@@ -118,26 +117,154 @@ def free_motion(
             for axis in range(3)
         ]
     )
-    error = add(goal[0], scale(-1.0, at.position))
+    stiffness, damping = STIFFNESS, DAMPING_RATE
+    if not isinstance(gain, float):
+        stiffness, damping = gain * STIFFNESS, jnp.sqrt(gain) * DAMPING_RATE
+    error = add(goal[0], scale(-1.0, site[0]))
     twisted: Vector = (0.0, 0.0, 0.0)
-    for now, wanted in zip(at.rotation, goal[1], strict=True):
+    for now, wanted in zip(site[1], goal[1], strict=True):
         twisted = add(twisted, scale(0.5, cross(now, wanted)))
-    wanted_force = [STIFFNESS * e - DAMPING_RATE * v for e, v in zip(error, linear, strict=True)]
-    wanted_torque = [
-        STIFFNESS * e - DAMPING_RATE * v for e, v in zip(twisted, angular, strict=True)
-    ]
+    linear, angular = twist
+    wanted_force = [stiffness * e - damping * v for e, v in zip(error, linear, strict=True)]
+    wanted_torque = [stiffness * e - damping * v for e, v in zip(twisted, angular, strict=True)]
     inverse = [[unrolled_linalg.inner(a, b) for b in halves] for a in halves[:3]]
     force = unrolled_linalg.apply_inverse3([row[:3] for row in inverse], wanted_force)
     inverse = [[unrolled_linalg.inner(a, b) for b in halves[3:]] for a in halves[3:]]
     torque = unrolled_linalg.apply_inverse3(inverse, wanted_torque)
-    task = joint_torque(columns, tuple(force), tuple(torque))
+    return joint_torque(columns, tuple(force), tuple(torque))
+
+
+def nullspace_torque(
+    columns: list[tuple[Vector, Vector]],
+    factor: list[list[Scalar]],
+    *,
+    mass: list[list[Scalar]],
+    offset: list[Scalar],
+    speeds: list[Scalar],
+) -> list[Scalar]:
+    """Torques that pull an arm of more than six joints to a rest pose without moving its site.
+
+        tau = (I - J' L J M^-1) M (k (q_0 - q) - 2 sqrt(k) dq),  L = (J M^-1 J')^-1,  k = 10
+
+    Source: robosuite 1.4.1, `controllers/osc.py` and `utils/control_utils.py`,
+    `nullspace_torques`. Zero for six joints, where the site's pose fixes them all.
+
+    Args:
+        columns, factor: As for `task_torque`.
+        mass: The inertia itself.
+        offset: q_0 - q, rad. speeds: dq, rad/s.
+    """
+    pull = [
+        POSTURE * away - 2.0 * POSTURE**0.5 * speed
+        for away, speed in zip(offset, speeds, strict=True)
+    ]
+    torque = [unrolled_linalg.inner(row, pull) for row in mass]
+    rows = [[column[part][axis] for column in columns] for part in (0, 1) for axis in range(3)]
+    halves = [unrolled_linalg.forward(factor, row) for row in rows]
+    inverse = unrolled_linalg.materialize(
+        [[unrolled_linalg.inner(a, b) for b in halves] for a in halves]
+    )
+    moved = [unrolled_linalg.inner(row, pull) for row in rows]  # J M^-1 (M pull)
+    held = unrolled_linalg.solve(unrolled_linalg.cholesky(inverse), moved)
+    return [
+        own - unrolled_linalg.inner([row[j] for row in rows], held) for j, own in enumerate(torque)
+    ]
+
+
+def arm_torque(
+    jacobian: jax.Array,
+    mass: jax.Array,
+    *,
+    position: jax.Array,
+    rotation: jax.Array,
+    speeds: jax.Array,
+    goal: tuple[jax.Array, jax.Array],
+    posture: jax.Array,
+    gain: Scalar = 1.0,
+) -> jax.Array:
+    """`task_torque` and (beyond six joints) `nullspace_torque` of an arm given as arrays, [J] N m.
+
+    Args:
+        jacobian: [J, 6] of the site: m and rad per rad, world axes.
+        mass: [J, J] joint-space inertia.
+        position, rotation: [3] m and [3, 3] (columns) of the site.
+        speeds: [J] rad/s.
+        goal: Position [3] and rotation [3, 3] that it is to have.
+        posture: [J] rad from the joints to their rest pose.
+        gain: Factor on the stiffness.
+    """
+    count = speeds.shape[0]
+    matrix = unrolled_linalg.materialize(
+        [[mass[i, j] for j in range(count)] for i in range(count)]
+    )
+    factor = unrolled_linalg.materialize(unrolled_linalg.cholesky(matrix))
+    columns = [(tuple(row[:3]), tuple(row[3:])) for row in jacobian]
+    twist = speeds @ jacobian
+    torque = task_torque(
+        columns,
+        factor,
+        site=(tuple(position), tuple(tuple(axis) for axis in rotation.T)),
+        twist=(tuple(twist[:3]), tuple(twist[3:])),
+        goal=(tuple(goal[0]), tuple(tuple(axis) for axis in goal[1].T)),
+        gain=gain,
+    )
+    if count > 6:
+        own = nullspace_torque(
+            columns, factor, mass=matrix, offset=list(posture), speeds=list(speeds)
+        )
+        torque = [a + b for a, b in zip(torque, own, strict=True)]
+    return jnp.stack(torque)
+
+
+def shifted(
+    position: jax.Array, rotation: jax.Array, action: jax.Array, held: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`new_goal` on arrays: position [3] m and rotation [3, 3] (columns)."""
+    place, turn = new_goal(
+        list(action), tuple(position), tuple(map(tuple, rotation.T)), tuple(map(tuple, held.T))
+    )
+    return jnp.stack(place), unrolled_linalg.array(turn).T
+
+
+def free_motion(
+    joints: list[Scalar],
+    speeds: list[Scalar],
+    *,
+    goal: tuple[Vector, Matrix],
+    tool: Tool,
+    weight: list[Scalar],
+    factors: Factors = NOMINAL,
+) -> Motion:
+    """Acceleration that the controller gives the arm where nothing touches it.
+
+    Args:
+        joints, speeds: rad, rad/s.
+        goal: Position (in the base's frame) and rotation of the grip site.
+        tool: In the hand.
+        weight: `bias_torque` at the start of the control step. It is added and compensated, so
+            that it matters only where a torque limit cuts in.
+        factors: On the gains and on the joints' damping and friction.
+    """
+    at = unrolled_linalg.materialize(frames(joints, tool))
+    columns = jacobian(at)
+    linear, angular = twist_of(columns, speeds)
+    matrix = unrolled_linalg.materialize(mass_matrix(at, tool))
+    factor = unrolled_linalg.materialize(unrolled_linalg.cholesky(matrix))
+    task = task_torque(
+        columns,
+        factor,
+        site=(at.position, at.rotation),
+        twist=(linear, angular),
+        goal=goal,
+        gain=factors.gain,
+    )
     air = joint_torque(columns, *drag(tool, at.rotation, (linear, angular)))
     net = []
     for index in range(6):
         limit = TORQUE_LIMIT[index]
         applied = jnp.clip(task[index] + weight[index], -limit, limit) - weight[index]
-        brake = DAMPING * speeds[index] + FRICTION_LOSS * jnp.tanh(speeds[index] / _SETTLING)
-        net.append(applied + air[index] - brake)
+        brake = joint_brake(speeds[index], DAMPING, FRICTION_LOSS)
+        net.append(applied + air[index] - factors.damping * brake)
     return Motion(
         at=at,
         columns=columns,
@@ -146,6 +273,14 @@ def free_motion(
         acceleration=unrolled_linalg.solve(factor, net),
         speeds=speeds,
     )
+
+
+def joint_brake(speed: Scalar, damping: float, friction: float) -> Scalar:
+    """Torque of damping and dry friction in a joint, N m, against its speed in rad/s.
+
+    Dry friction builds up within 1e-3 rad/s (tanh): MuJoCo's own costs a solver row per joint.
+    """
+    return damping * speed + friction * jnp.tanh(speed / _SETTLING)
 
 
 def free_steps(

@@ -34,7 +34,8 @@ def nut_xml() -> str:
     return nut_scene(
         grasp_contact.BEADS,
         grasp_contact.FEET,
-        pads=2 * len(gripper.PAD_ROWS),
+        pads=gripper.PADS,
+        tips=gripper.TIPS,
         soft=soft,
         friction=grasp_contact.FRICTION,
     )

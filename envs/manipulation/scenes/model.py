@@ -7,8 +7,8 @@ works on. Contacts of the arm itself end an episode and are found by distance (`
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ INITIAL_NOISE = 0.02  # rad, standard deviation per joint
 JOINT_LIMIT = np.array([6.28319, 6.28319, 3.14159, 6.28319, 6.28319, 6.28319])
 TORQUE_LIMIT = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
 FRICTION_LOSS = 0.01  # N m, every arm joint
+PAD_SPHERE = 0.001  # m, radius of the spheres that stand for points of a gripper's pad
 
 WIPING_BASE = (-0.41, 0.0, 0.912)
 NUT_BASE = (-0.56, 0.0, 0.912)
@@ -135,6 +136,13 @@ class Tool(NamedTuple):
     inertia: tuple[float, float, float]
     grip: float
     box: float
+
+    def heavier(self, factor: Any) -> Tool:
+        """The tool with mass and inertia times `factor` (a plain 1 changes nothing)."""
+        if isinstance(factor, float):
+            return self
+        across, along = factor * self.inertia[0], factor * self.inertia[2]
+        return self._replace(mass=factor * self.mass, inertia=(across, across, along))
 
 
 WIPER = Tool(mass=0.03, centre=0.015, inertia=(0.01, 0.01, 0.01), grip=0.03, box=2**0.5)
@@ -304,15 +312,24 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
     return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
-def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, friction: float) -> str:
+def nut_scene(
+    beads: np.ndarray,
+    feet: np.ndarray,
+    *,
+    pads: Mapping[str, Sequence[str]],
+    tips: Mapping[str, Sequence[str]],
+    soft: str,
+    friction: float,
+) -> str:
     """MJCF of nut assembly.
 
-    The inner fingers are fixed to the knuckles here; `twins.py` turns them, and moves the pads'
-    points, as the gripper's state says.
+    The inner fingers are fixed to the knuckles here; back ends move the pads' spheres, and drawing
+    turns the fingers, as the gripper's state says.
 
     Args:
         beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
-        pads: Number of contact points on each pad.
+        pads, tips: Names of the contact spheres of each finger, "left" and "right": of its pad,
+            which meets the handle, and of the pad's lower edge, which meets the table.
         soft: solref and solimp, as MJCF attributes.
         friction: Friction of all contacts.
     """
@@ -320,8 +337,7 @@ def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, fric
     fingers = ""
     for side, sign in (("left", -1), ("right", 1)):
         points = "".join(
-            f'<body name="{side}_pad_{i}">{sphere.format(f"{side}_{i}", 0.001, "0 0 0")}</body>'
-            for i in range(pads)
+            sphere.format(name, PAD_SPHERE, "0 0 0") for name in (*pads[side], *tips[side])
         )
         quat = "1 0 0 0" if sign > 0 else "0 0 0 1"
         fingers += f"""
@@ -362,14 +378,14 @@ def nut_scene(beads: np.ndarray, feet: np.ndarray, *, pads: int, soft: str, fric
 <geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
   rgba=".6 .62 .65 1"/>"""
     pairs = "".join(
-        _pair(f"{side}_{i}", f"{side}_{i}", "handle", friction=friction, soft=soft)
+        _pair(name, name, "handle", friction=friction, soft=soft)
         for side in ("left", "right")
-        for i in range(pads)
+        for name in pads[side]
     )
     pairs += "".join(
-        _pair(f"{side}_tip_{i}", "table", f"{side}_{i}", friction=friction, soft=soft)
+        _pair(name, "table", name, friction=friction, soft=soft)
         for side in ("left", "right")
-        for i in (0, pads // 2)
+        for name in tips[side]
     )
     pairs += "".join(
         _pair(f"foot_{i}", "table", f"foot_{i}", friction=friction, soft=soft)

@@ -9,11 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control import operational_space
 from envs.manipulation.physics.analytic import gripper, unrolled_linalg
-from envs.manipulation.physics.analytic.arm import bias_torque, frames, jacobian, twist_of
-from envs.manipulation.physics.analytic.grasp_contact import Ring, hold
-from envs.manipulation.physics.analytic.quaternion import hand_quaternion, multiply
+from envs.manipulation.physics.analytic.arm import frames, jacobian, twist_of
+from envs.manipulation.physics.analytic.quaternion import (
+    hand_quaternion,
+    multiply,
+    rotation_matrix,
+    turned,
+)
+from envs.manipulation.randomisation import Ranges
 from envs.manipulation.scenes.model import (
     GRIPPER,
     HANDLE,
@@ -21,7 +25,6 @@ from envs.manipulation.scenes.model import (
     INITIAL_NOISE,
     NUT_BASE,
     PEG,
-    SUBSTEPS,
     TIMESTEP,
 )
 from envs.manipulation.tasks.base import ArmTask, lagged_frames
@@ -82,33 +85,14 @@ class NutParams:
     Attributes:
         joints: [S, 6] rad. place: [S, 3] x, y (m, world) and yaw of the ring. number: [S].
         reward_scale: Factor on robosuite's reward.
+        ranges: Of the domain randomisation, or None.
     """
 
     joints: jax.Array
     place: jax.Array
     number: jax.Array
     reward_scale: jax.Array | float = 1.0
-
-
-def rotation_matrix(quaternion: jax.Array) -> jax.Array:
-    """[3, 3] of w x y z; columns are the axes."""
-    w, x, y, z = quaternion
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
-
-
-def turned(quaternion: jax.Array, spin: jax.Array, time: float) -> jax.Array:
-    """Quaternion after turning by `spin` (world axes) for `time`."""
-    angle = jnp.sqrt(jnp.sum(spin * spin) + 1e-20)
-    half = 0.5 * time * angle
-    axis = jnp.sin(half) / angle * spin
-    new = jnp.stack(multiply((jnp.cos(half), *axis), tuple(quaternion)))
-    return new / jnp.sqrt(jnp.sum(new * new))
+    ranges: Ranges | None = None
 
 
 def lagged_ring(state: NutState) -> tuple[jax.Array, jax.Array]:
@@ -120,80 +104,6 @@ def lagged_ring(state: NutState) -> tuple[jax.Array, jax.Array]:
 def handle_of(position: jax.Array, quaternion: jax.Array) -> jax.Array:
     """Centre of the handle, [3]."""
     return position + rotation_matrix(quaternion) @ jnp.array(HANDLE)
-
-
-def advance(state: NutState, action: jax.Array) -> NutState:
-    """One control step of the physics: 25 steps of 2 ms; time and contact flag included.
-
-    On a CPU a batch goes one world after another: the contact solver is as fast with one as with
-    many, and then stops in each world as soon as it has converged.
-    """
-    if jax.default_backend() == "cpu":
-        return jax.custom_batching.sequential_vmap(_advance)(state, action)
-    return _advance(state, action)
-
-
-def _advance(state: NutState, action: jax.Array) -> NutState:
-    at = unrolled_linalg.materialize(frames(list(state.joints), GRIPPER))
-    action = jnp.clip(action, -1.0, 1.0)
-    first, second, third = state.goal_rotation
-    held = (tuple(first), tuple(second), tuple(third))
-    goal = unrolled_linalg.materialize(
-        operational_space.new_goal(list(action[:6]), at.position, at.rotation, held)
-    )
-    weight = unrolled_linalg.materialize(bias_torque(at, GRIPPER, list(state.speeds)))
-    grip = gripper.RAMP * jnp.sign(action[6])
-
-    def step(s: NutState, _: None) -> tuple[NutState, None]:
-        command = jnp.clip(s.command + grip, -1.0, 1.0)
-        motion = operational_space.free_motion(
-            list(s.joints), list(s.speeds), goal=goal, tool=GRIPPER, weight=weight
-        )
-        ring = Ring(
-            position=s.position - BASE,
-            rotation=rotation_matrix(s.quaternion),
-            velocity=s.velocity,
-            spin=s.spin,
-        )
-        knuckles, inner = s.fingers[::3], s.fingers[1::3]
-        result = hold(
-            motion,
-            ring,
-            fingers=knuckles,
-            finger_speeds=s.finger_speeds[::3],
-            inner=inner,
-            control=gripper.command_to_control(command),
-            start=s.acceleration,
-        )
-        a = result.acceleration
-        speeds = s.speeds + TIMESTEP * a[:6]
-        knuckle_speeds = s.finger_speeds[::3] + TIMESTEP * a[6:8]
-        knuckles = knuckles + TIMESTEP * knuckle_speeds
-        finger_rest, knuckle_rest = gripper.following_rest(knuckles, result.squeeze)
-        inner_speeds = (finger_rest - inner) / gripper.FOLLOW
-        outer = s.fingers[2::3]
-        outer_speeds = (knuckle_rest - outer) / gripper.FOLLOW
-        velocity, spin = s.velocity + TIMESTEP * a[8:11], s.spin + TIMESTEP * a[11:]
-        return dataclasses.replace(
-            s,
-            joints=s.joints + TIMESTEP * speeds,
-            speeds=speeds,
-            acceleration=a,
-            fingers=jnp.stack(
-                [knuckles, inner + TIMESTEP * inner_speeds, outer + TIMESTEP * outer_speeds], -1
-            ).reshape(6),
-            finger_speeds=jnp.stack([knuckle_speeds, inner_speeds, outer_speeds], -1).reshape(6),
-            command=command,
-            touching=jnp.all(result.touching),
-            position=s.position + TIMESTEP * velocity,
-            quaternion=turned(s.quaternion, spin, TIMESTEP),
-            velocity=velocity,
-            spin=spin,
-        ), None
-
-    rows = unrolled_linalg.array(goal[1])
-    start = dataclasses.replace(state, goal_rotation=rows, time=state.time + 1)
-    return jax.lax.scan(step, start, None, length=SUBSTEPS)[0]
 
 
 def stages(
@@ -256,7 +166,8 @@ class NutAssembly(ArmTask):
     def reset_to(self, index: jax.Array, key: jax.Array, params: NutParams) -> NutState:
         """The start of scenario `index` of the pool."""
         del key  # a scenario is deterministic
-        joints, place = params.joints[index], params.place[index]
+        joints = self.first_joints(params.joints[index], index, params)
+        place = params.place[index]
         at = frames(list(joints), GRIPPER)
         zero = jnp.zeros(())
         return NutState(
@@ -281,12 +192,15 @@ class NutAssembly(ArmTask):
     ) -> tuple[NutState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key  # the world is deterministic
-        return self.finish(state, advance(state, action), params)
+        moved = self.backend.advance(
+            state, jnp.clip(action, -1.0, 1.0), self.factors(state, params)
+        )
+        return self.finish(state, moved, params)
 
     def finish(
         self, state: NutState, moved: NutState, params: NutParams
     ) -> tuple[NutState, Outcome]:
-        """The result of a control step, given its physics (see `advance`)."""
+        """The result of a control step, given its physics (see `Backend.advance`)."""
         values = [leaf for leaf in jax.tree.leaves(moved) if leaf.dtype == jnp.float32]
         physics_diverged = ~jnp.all(
             jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in values]))
@@ -341,7 +255,7 @@ class NutAssembly(ArmTask):
         w, x, y, z = multiply(back, tuple(quaternion))
         relative = jnp.stack([x, y, z, w]) * jnp.where(w < 0, -1.0, 1.0)
         axes = unrolled_linalg.array(at.links[6][1])
-        return jnp.concatenate(
+        seen = jnp.concatenate(
             [
                 position,
                 jnp.roll(quaternion, -1),
@@ -356,6 +270,7 @@ class NutAssembly(ArmTask):
                 state.finger_speeds,
             ]
         )
+        return self.with_sensor_noise(seen, state, params)
 
 
 def make_params(numbers: range) -> NutParams:

@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control import operational_space
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import (
     Frames,
-    bias_torque,
     frames,
     jacobian,
     twist_of,
 )
 from envs.manipulation.physics.analytic.collision import arm_hits
 from envs.manipulation.physics.analytic.quaternion import hand_quaternion
-from envs.manipulation.physics.analytic.wipe_contact import POINTS, press
+from envs.manipulation.physics.analytic.wipe_contact import (
+    POINTS,
+    TABLE_CENTRE,
+    TABLE_HALF,
+    TABLE_TOP,
+    over_table,
+)
+from envs.manipulation.randomisation import Ranges
 from envs.manipulation.scenes.model import (
     INITIAL_JOINTS,
     INITIAL_NOISE,
     JOINT_LIMIT,
-    SUBSTEPS,
     TIMESTEP,
     WIPER,
     WIPING_BASE,
@@ -52,11 +56,6 @@ LIMIT_MARGIN = 0.1  # rad before a joint's limit, where an episode ends
 
 BASE = np.array(WIPING_BASE, np.float32)
 _CENTRE, _HALF, _TOP = WIPING_TABLE
-_TABLE = (
-    np.array(_CENTRE, np.float32) - BASE[:2],
-    np.array(_HALF, np.float32),
-    float(_TOP - WIPING_BASE[2]),
-)
 _FAR = -10.0  # height of "no table", m
 _SPHERES = np.stack(
     np.meshgrid([-0.06, -0.04, -0.02, 0.0, 0.02, 0.04, 0.06], [-0.025, 0.025]), -1
@@ -103,17 +102,19 @@ class WipingParams:
     Attributes:
         joints: [S, 6] rad. markers: [S, 100, 2] in the world, m. number: [S] of the scenarios.
         reward_scale: Factor on robosuite's raw reward.
+        ranges: Of the domain randomisation, or None.
     """
 
     joints: jax.Array
     markers: jax.Array
     number: jax.Array
     reward_scale: jax.Array | float = NORMALISATION
+    ranges: Ranges | None = None
 
 
 def gap_below(at: Frames) -> jax.Array:
     """Height of the wiper's face above the table, m."""
-    return at.position[2] - _TABLE[2]
+    return at.position[2] - TABLE_TOP
 
 
 def contact_count(at: Frames, table: jax.Array) -> jax.Array:
@@ -133,7 +134,7 @@ def under_face(at: Frames, markers: jax.Array) -> jax.Array:
     """
     x, y, z = at.rotation
     east, north = markers[:, 0] - at.position[0], markers[:, 1] - at.position[1]
-    up = _TABLE[2] - at.position[2]
+    up = TABLE_TOP - at.position[2]
     along, across, below = (east * axis[0] + north * axis[1] + up * axis[2] for axis in (x, y, z))
     inside = (jnp.abs(along) < HALF_FACE[0]) & (jnp.abs(across) < HALF_FACE[1])
     return inside & (below < 0) & (below > -WIPE_DEPTH)
@@ -164,39 +165,6 @@ class Moved(NamedTuple):
     acceleration: jax.Array
     goal_rotation: jax.Array
     push: jax.Array
-
-
-def advance(state: WipingState, action: jax.Array) -> Moved:
-    """One control step of the physics: 25 steps of 2 ms."""
-    at = unrolled_linalg.materialize(frames(list(state.joints), WIPER))
-    action = jnp.clip(action, -1.0, 1.0)
-    first, second, third = state.goal_rotation
-    held = (tuple(first), tuple(second), tuple(third))
-    goal = unrolled_linalg.materialize(
-        operational_space.new_goal(list(action), at.position, at.rotation, held)
-    )
-    weight = unrolled_linalg.materialize(bias_torque(at, WIPER, list(state.speeds)))
-    over = jnp.all(jnp.abs(jnp.stack(at.position[:2]) - _TABLE[0]) < _TABLE[1])
-    table = jnp.where(over, _TABLE[2], _FAR)
-
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        joints, speeds, acceleration, _ = carry
-        motion = operational_space.free_motion(
-            list(joints), list(speeds), goal=goal, tool=WIPER, weight=weight
-        )
-        touch = press(motion, table, acceleration)
-        speeds = speeds + TIMESTEP * touch.acceleration
-        return (joints + TIMESTEP * speeds, speeds, touch.acceleration, touch.force), None
-
-    carry = (state.joints, state.speeds, state.acceleration, jnp.zeros(3))
-    joints, speeds, acceleration, force = jax.lax.scan(step, carry, None, length=SUBSTEPS)[0]
-    return Moved(
-        joints=joints,
-        speeds=speeds,
-        acceleration=acceleration,
-        goal_rotation=unrolled_linalg.array(goal[1]),
-        push=force,
-    )
 
 
 def reward_of(
@@ -266,7 +234,7 @@ class TableWiping(ArmTask):
     def reset_to(self, index: jax.Array, key: jax.Array, params: WipingParams) -> WipingState:
         """The start of scenario `index` of the pool."""
         del key  # a scenario is deterministic
-        joints = params.joints[index]
+        joints = self.first_joints(params.joints[index], index, params)
         at = frames(list(joints), WIPER)
         return WipingState(
             joints=joints,
@@ -288,12 +256,15 @@ class TableWiping(ArmTask):
     ) -> tuple[WipingState, Outcome]:
         """One control step of 0.05 s, without reset."""
         del key  # the world is deterministic
-        return self.finish(state, advance(state, action), params)
+        moved = self.backend.advance(
+            state, jnp.clip(action, -1.0, 1.0), self.factors(state, params)
+        )
+        return self.finish(state, moved, params)
 
     def finish(
         self, state: WipingState, moved: Moved, params: WipingParams
     ) -> tuple[WipingState, Outcome]:
-        """The result of a control step, given its physics (see `advance`)."""
+        """The result of a control step, given its physics (see `Backend.advance`)."""
         joints, speeds, acceleration, goal_rotation, push = moved
         physics_diverged = ~jnp.all(
             jnp.isfinite(jnp.concatenate([joints, speeds, acceleration, push]))
@@ -312,13 +283,14 @@ class TableWiping(ArmTask):
         )
         at = lagged_frames(arm, WIPER)
         turn = unrolled_linalg.array(at.rotation)
-        weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass])
+        heavier = self.factors(state, params).mass
+        weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass]) * heavier
         force = sound(-turn @ (push + weight), state.force)
         contact = jnp.linalg.norm(force - state.force_bias) > CONTACT_FORCE
-        over = jnp.all(jnp.abs(jnp.stack(at.position[:2]) - _TABLE[0]) < _TABLE[1])
-        count = contact_count(at, jnp.where(over, _TABLE[2], _FAR))
+        over = over_table(jnp.stack(at.position[:2]))
+        count = contact_count(at, jnp.where(over, TABLE_TOP, _FAR))
         at_limit = jnp.any(JOINT_LIMIT - jnp.abs(joints) < LIMIT_MARGIN)
-        hit = arm_hits(at, _TOOL_ENDS, _TABLE)
+        hit = arm_hits(at, _TOOL_ENDS, (TABLE_CENTRE, TABLE_HALF, TABLE_TOP))
         unsafe = hit | at_limit
         newly = under_face(at, state.markers - BASE[:2]) & ~state.wiped & (count > 0) & ~unsafe
         wiped = state.wiped | newly
@@ -375,7 +347,7 @@ class TableWiping(ArmTask):
         lagged = list(state.joints - TIMESTEP * state.speeds)
         eef = jnp.stack(frames(lagged, WIPER).position) + BASE
         share, radius, centroid = remaining(state.markers, state.shown)
-        return jnp.concatenate(
+        seen = jnp.concatenate(
             [
                 jnp.stack([share, radius]),
                 centroid,
@@ -388,6 +360,7 @@ class TableWiping(ArmTask):
                 state.contact.astype(jnp.float32)[None],
             ]
         )
+        return self.with_sensor_noise(seen, state, params)
 
 
 def make_params(numbers: range) -> WipingParams:

@@ -167,7 +167,7 @@ def _bodies(at: Frames, tool: Tool):
         yield link.mass, add(position, combine(rotation, link.centre)), (a, k, axis)
     position, hand = at.links[6]
     a, b, c = tool.inertia
-    if a != b:
+    if a is not b and a != b:
         raise ValueError(f"a tool's inertia must be the same about x and y, got {tool.inertia}")
     yield tool.mass, add(position, scale(tool.centre, hand[2])), (a, c - a, hand[2])
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from envs.manipulation.physics.analytic import gripper, unrolled_linalg
 from envs.manipulation.physics.analytic.arm import Motion
-from envs.manipulation.physics.analytic.contact import cone, cone_cost, cone_force
+from envs.manipulation.physics.analytic.contact import Friction, cone, cone_cost, cone_force
+from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
     HANDLE,
     HANDLE_HALF,
@@ -32,7 +33,6 @@ from envs.manipulation.scenes.model import (
     RING_INERTIA,
     RING_MASS,
     RING_RADIUS,
-    TIMESTEP,
 )
 
 ITERATIONS, CONVERGED = 8, 1e-4  # of Newton's method: at most, and the step's energy to stop at
@@ -57,6 +57,7 @@ FEET = np.concatenate(
 )
 _ROWS = len(gripper.PAD_ROWS)
 _PADS = 4 * _ROWS  # points on the pads: left then right finger, two per row
+_EDGE = np.array([0, _ROWS, 2 * _ROWS, 3 * _ROWS])  # those of the lower edges, which meet the table
 
 
 class Ring(NamedTuple):
@@ -173,8 +174,9 @@ def hold(
     fingers: jax.Array,
     finger_speeds: jax.Array,
     inner: jax.Array,
-    control: jax.Array,
+    command: jax.Array,
     start: jax.Array,
+    factors: Factors = NOMINAL,
 ) -> Held:
     """One physics step's accelerations.
 
@@ -182,48 +184,43 @@ def hold(
         motion: The arm without contact.
         ring: Ring.
         fingers, finger_speeds, inner: [2] knuckles, their speeds, inner finger angles.
-        control: Servo target of the knuckles, rad.
+        command: Of the gripper, -1 open to 1 closed.
         start: [14] acceleration to start from: the last step's.
+        factors: On friction and on the ring's mass.
     """
     origin, axes = hand_axes(motion)
     pads, slopes = pad_points(origin, axes, fingers, inner)
-    tips = (
-        jnp.stack(
-            [
-                pads[:1] + pads[_ROWS : _ROWS + 1],
-                pads[2 * _ROWS : 2 * _ROWS + 1] + pads[3 * _ROWS : 3 * _ROWS + 1],
-            ]
-        )[:, 0]
-        / 2
-    )
-    tip_slopes = jnp.stack([slopes[0], slopes[2 * _ROWS]])
+    tips, tip_slopes = pads[_EDGE], slopes[_EDGE]
     beads = ring.position + BEADS @ ring.rotation.T
     feet = ring.position + FEET @ ring.rotation.T
     groups = (on_handle(pads, ring), _upward(tips), _upward(feet), _around_peg(beads))
     gap, place, normal, tangent = (jnp.concatenate(parts) for parts in zip(*groups, strict=True))
     frame = jnp.stack([tangent, jnp.cross(normal, tangent), normal])  # [3, C, 3]
 
-    carried = _PADS + 2  # by a finger; the rest belong to the ring, and so do the pads' partners
+    carried = _PADS + len(_EDGE)  # by a finger; the rest belong to the ring, and so do the pads' partners
     site = jnp.stack(motion.at.position)
     linear = unrolled_linalg.array(part for part, _ in motion.columns)  # [6, 3]
     angular = unrolled_linalg.array(part for _, part in motion.columns)
     arm_place = place[:carried] - site
     swept = linear[:, None] + jnp.cross(angular[:, None], arm_place[None])  # [6, F, 3]
     by_arm = jnp.sum(frame[:, :carried, None] * jnp.swapaxes(swept, 0, 1)[None], -1)  # [3, F, 6]
-    left = np.concatenate([np.ones(2 * _ROWS), np.zeros(2 * _ROWS), [1, 0]])
+    left = np.concatenate([np.ones(2 * _ROWS), np.zeros(2 * _ROWS), [1, 1, 0, 0]])
     by_finger = jnp.sum(frame[:, :carried] * jnp.concatenate([slopes, tip_slopes]), -1)
     by_finger = jnp.stack([by_finger * left, by_finger * (1 - left)], -1)  # [3, F, 2]
-    sign = np.concatenate([-np.ones(_PADS), np.zeros(2), np.ones(len(FEET) + len(BEADS))])
+    sign = np.concatenate([-np.ones(_PADS), np.zeros(len(_EDGE)), np.ones(len(FEET) + len(BEADS))])
     arms = place - ring.position
     by_ring = jnp.concatenate([frame, jnp.cross(arms[None], frame)], -1) * sign[None, :, None]
     none = np.zeros((3, len(FEET) + len(BEADS), 8), np.float32)
     mover = jnp.concatenate([jnp.concatenate([by_arm, by_finger], -1), none], 1)
     rows = jax.lax.optimization_barrier(jnp.concatenate([mover, by_ring], -1))  # [3, C, 14]
 
-    mass, free = _inertia(motion, ring, fingers, finger_speeds, control=control)
+    mass, free = _inertia(
+        motion, ring, fingers, finger_speeds, command=command, heavier=factors.mass
+    )
+    friction = FRICTION * factors.friction
     speed = jnp.concatenate([jnp.stack(motion.speeds), finger_speeds, ring.velocity, ring.spin])
     inverse = np.concatenate(
-        [np.full(_PADS, 57.2), np.full(2, 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
+        [np.full(_PADS, 57.2), np.full(len(_EDGE), 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
     )
     weight = jnp.where(gap < 0, IMPEDANCE / ((1 - IMPEDANCE) * inverse), 0.0)
     depth = jnp.maximum(-gap, 0.0)
@@ -239,7 +236,8 @@ def hold(
             lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
             return jnp.concatenate([by_mover, lower])
 
-        return _newton(rows, rest, weight, mass, free=free, start=start, curvature=curvature)
+        return _newton(rows, rest, weight, mass, free=free, start=start, friction=friction,
+                       curvature=curvature)
 
     def apart() -> jax.Array:
         own = rows[:, carried:, 8:]
@@ -250,13 +248,14 @@ def hold(
             mass[8:, 8:],
             free=free[8:],
             start=start[8:],
+            friction=friction,
             curvature=lambda bent: own.reshape(-1, 6).T @ bent.reshape(-1, 6),
         )
         return jnp.concatenate([free[:8], alone])
 
     # where no finger touches anything, the ring is alone with table and peg
     a = jax.lax.cond(jnp.any(gap[:carried] < 0), together, apart)
-    force = cone_force(rows @ a + rest, weight, FRICTION)
+    force = cone_force(rows @ a + rest, weight, friction)
     squeeze = force[2, :_PADS].reshape(2, 2 * _ROWS)
     touching = jnp.any(gap[:_PADS].reshape(2, 2 * _ROWS) < 0, -1)
     return Held(acceleration=a, squeeze=jnp.sum(squeeze, -1), touching=touching)
@@ -270,6 +269,7 @@ def _newton(
     *,
     free: jax.Array,
     start: jax.Array,
+    friction: Friction,
     curvature: Callable[[jax.Array], jax.Array],
 ) -> jax.Array:
     """Minimise 1/2 (a - free)' M (a - free) + cones(rows a + rest) from the better of two starts.
@@ -278,17 +278,18 @@ def _newton(
         rows: [3, C, N] Jacobian. rest: [3, C] what the residual is without acceleration.
         weight: [C].
         mass: [N, N]. free, start: [N] acceleration without contact, and the last step's.
+        friction: Coefficient.
         curvature: `curvature(bent [3, C, N]) -> rows' bent [N, N]`.
     """
 
     def cost(a: jax.Array) -> jax.Array:
         off = a - free
-        return 0.5 * off @ mass @ off + cone_cost(rows @ a + rest, weight, FRICTION)
+        return 0.5 * off @ mass @ off + cone_cost(rows @ a + rest, weight, friction)
 
     def improve(carry: tuple[jax.Array, jax.Array, jax.Array]) -> Any:
         a, _, count = carry
         at = rows @ a + rest
-        force, h = cone(at, weight, FRICTION)
+        force, h = cone(at, weight, friction)
         bent = jnp.stack(
             [
                 h[0][:, None] * rows[0] + h[1][:, None] * rows[1] + h[3][:, None] * rows[2],
@@ -304,7 +305,7 @@ def _newton(
         # convex, so that its slope along the step has one zero, between two of the tries
         along = rows @ move
         there = at[:, None] + _TRIES[:, None] * along[:, None]  # [3, K, C]
-        pulled = jnp.sum(cone_force(there, weight, FRICTION) * along[:, None], (0, 2))
+        pulled = jnp.sum(cone_force(there, weight, friction) * along[:, None], (0, 2))
         bend = mass @ move
         slope = (a - free) @ bend + _TRIES * (move @ bend) - pulled
         ends = jnp.concatenate([-energy[None], slope])
@@ -329,21 +330,18 @@ def _inertia(
     fingers: jax.Array,
     finger_speeds: jax.Array,
     *,
-    control: jax.Array,
+    command: jax.Array,
+    heavier: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Mass matrix [14, 14] and the acceleration without contact [14].
+    """Mass matrix [14, 14] and the acceleration without contact [14]; `heavier` is the ring's."""
+    finger_mass = gripper.SERVO_INERTIA
+    finger_free = gripper.servo(command, fingers, finger_speeds) / finger_mass
 
-    The fingers' servo and damping are taken implicitly: they are stiff against 2 ms.
-    """
-    stiff, damp = gripper.STIFFNESS, gripper.STIFFNESS * gripper.LAG
-    finger_mass = gripper.INERTIA + TIMESTEP * damp + TIMESTEP**2 * stiff
-    pull = stiff * (gripper.knuckle_rest(control) - fingers - TIMESTEP * finger_speeds)
-    finger_free = (pull - damp * finger_speeds) / finger_mass
-
+    ring_mass = RING_MASS * heavier
     centre = RING_CENTRE * ring.rotation[:, 0]
-    about = (ring.rotation * RING_INERTIA) @ ring.rotation.T
-    about = about + RING_MASS * (jnp.sum(centre * centre) * jnp.eye(3) - jnp.outer(centre, centre))
-    skew = RING_MASS * jnp.array(
+    about = (ring.rotation * (RING_INERTIA * heavier)) @ ring.rotation.T
+    about = about + ring_mass * (jnp.sum(centre * centre) * jnp.eye(3) - jnp.outer(centre, centre))
+    skew = ring_mass * jnp.array(
         [
             [jnp.zeros(()), -centre[2], centre[1]],
             [centre[2], jnp.zeros(()), -centre[0]],
@@ -351,11 +349,11 @@ def _inertia(
         ]
     )
     spin = ring.spin
-    whirl = RING_MASS * jnp.cross(spin, jnp.cross(spin, centre))
-    weight = jnp.array([0.0, 0.0, -9.81 * RING_MASS])
+    whirl = ring_mass * jnp.cross(spin, jnp.cross(spin, centre))
+    weight = ring_mass * jnp.array([0.0, 0.0, -9.81])
     force = weight - whirl - RING_DAMPING * ring.velocity
     torque = jnp.cross(centre, weight) - jnp.cross(spin, about @ spin) - RING_DAMPING * spin
-    own = jnp.block([[RING_MASS * jnp.eye(3), -skew], [skew, about]])
+    own = jnp.block([[ring_mass * jnp.eye(3), -skew], [skew, about]])
     ring_free = unrolled_linalg.solve_array(own, jnp.concatenate([force, torque]))
 
     mass = (

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.manipulation.scenes.model import PAD_SPHERE, TIMESTEP
+
 Scalar = Any  # a float, or a traced scalar
 
 RAMP = 0.01  # change of the command per physics step towards the sign of the action
@@ -42,6 +44,10 @@ TIP = 0.03242
 FACE = -0.0253  # of the pad, towards the other finger
 PAD_HALF = 0.011  # along the hand's x
 PAD_ROWS = np.array([0.01875, 0.006, -0.007])  # along the pad, from its centre to the tip
+
+# the knuckles' servo and its damping are taken implicitly: they are stiff against 2 ms
+SERVO_DAMPING = STIFFNESS * LAG  # N m s/rad
+SERVO_INERTIA = INERTIA + TIMESTEP * SERVO_DAMPING + TIMESTEP**2 * STIFFNESS  # kg m^2
 
 
 def command_to_control(command: Scalar) -> Scalar:
@@ -84,3 +90,60 @@ def pad_rows(knuckle: jax.Array, inner: jax.Array) -> tuple[jax.Array, jax.Array
     out_z = FINGER[0] * sine + FINGER[1] * cosine + FACE * tilt + along * level
     place = jnp.stack([_KNUCKLE[0] + out_y, _KNUCKLE[1] + out_z], -1)
     return place, jnp.stack([-out_z, out_y], -1)
+
+
+def servo(command: Scalar, knuckles: jax.Array, speeds: jax.Array) -> jax.Array:
+    """Torque of the servos on both knuckles, [2] N m, for an inertia of `SERVO_INERTIA`.
+
+    Args:
+        command: Of the gripper, -1 open to 1 closed.
+        knuckles, speeds: [2] rad, rad/s.
+    """
+    pull = knuckle_rest(command_to_control(command)) - knuckles - TIMESTEP * speeds
+    return STIFFNESS * pull - SERVO_DAMPING * speeds
+
+
+def follow(
+    knuckles: jax.Array, inner: jax.Array, outer: jax.Array, squeeze: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Speeds of inner fingers and inner knuckles, [2] rad/s each, for a physics step.
+
+    Args:
+        knuckles: [2] at the step's end, rad.
+        inner, outer: [2] inner fingers and inner knuckles at its start, rad.
+        squeeze: [2] N.
+    """
+    inner_rest, outer_rest = following_rest(knuckles, squeeze)
+    return (inner_rest - inner) / FOLLOW, (outer_rest - outer) / FOLLOW
+
+
+SIDES = ("left", "right")
+# a finger's spheres in MJCF, in the order of `pad_spheres`
+PADS = {side: tuple(f"{side}_{i}" for i in range(2 * len(PAD_ROWS))) for side in SIDES}
+TIPS = {side: tuple(f"{side}_tip_{i}" for i in range(2)) for side in SIDES}
+
+
+def pad_spheres(knuckles: Any, inner: Any) -> jax.Array:
+    """Centres of both fingers' spheres in the frames of their knuckles, [2, 8, 3] m.
+
+    The pad's have their surface in the pad's face. The tips' have their lowest point, seen along
+    the hand, in the pad's lower edge, which is what meets a table below.
+
+    Args:
+        knuckles, inner: [2] rad.
+    """
+    along = TIP + PAD_ROWS
+    sine, cosine = jnp.sin(inner)[:, None], jnp.cos(inner)[:, None]
+    y = FINGER[0] + FACE * cosine - along * sine
+    z = FINGER[1] + FACE * sine + along * cosine
+    x = np.repeat([-PAD_HALF, PAD_HALF], len(along))
+    face = jnp.stack(
+        [jnp.broadcast_to(x, (2, len(x))), jnp.tile(y + PAD_SPHERE, (1, 2)), jnp.tile(z, (1, 2))],
+        -1,
+    )
+    edge_y = y[:, 0] - PAD_SPHERE * jnp.sin(knuckles)
+    edge_z = z[:, 0] - PAD_SPHERE * jnp.cos(knuckles)
+    tips = [
+        jnp.stack([jnp.full(2, sign * PAD_HALF), edge_y, edge_z], -1) for sign in (-1.0, 1.0)
+    ]
+    return jnp.concatenate([face, jnp.stack(tips, 1)], 1)

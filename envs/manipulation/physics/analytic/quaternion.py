@@ -35,3 +35,24 @@ def hand_quaternion(joints: list[Scalar]) -> jax.Array:
         total = multiply(total, turn)
     w, x, y, z = multiply(total, (_HALF_TURN, -_HALF_TURN, 0.0, 0.0))
     return jnp.stack([x, y, z, w])
+
+
+def rotation_matrix(quaternion: jax.Array) -> jax.Array:
+    """[3, 3] of w x y z; columns are the axes."""
+    w, x, y, z = quaternion
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def turned(quaternion: jax.Array, spin: jax.Array, time: float) -> jax.Array:
+    """Quaternion after turning by `spin` (world axes) for `time`."""
+    angle = jnp.sqrt(jnp.sum(spin * spin) + 1e-20)
+    half = 0.5 * time * angle
+    axis = jnp.sin(half) / angle * spin
+    new = jnp.stack(multiply((jnp.cos(half), *axis), tuple(quaternion)))
+    return new / jnp.sqrt(jnp.sum(new * new))

@@ -19,7 +19,8 @@ import numpy as np
 
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import Motion, cross
-from envs.manipulation.physics.analytic.contact import cone, cone_force, impedance
+from envs.manipulation.physics.analytic.contact import Friction, cone, cone_force, impedance
+from envs.manipulation.scenes.model import WIPING_BASE, WIPING_TABLE
 
 # Contact of one point. MuJoCo 2.3.7 reports half of the true depth for a box that lies flat on
 # another, so that robosuite's wiper is twice as soft as its table of parameters says; the
@@ -34,6 +35,10 @@ ITERATIONS = 2
 _X = np.array([-60, -50, -45, -35, -25, -15, -5, 5, 15, 25, 35, 45, 50, 60]) * 1e-3
 _Y = np.array([-30, -10, 10, 30]) * 1e-3
 POINTS = np.stack(np.meshgrid(_X, _Y, indexing="ij"), -1).reshape(-1, 2).astype(np.float32)
+# in the frame of the arm's base: centre [2] and half size [2] of the table's top, and its height
+TABLE_CENTRE = np.array(WIPING_TABLE[0], np.float32) - np.array(WIPING_BASE[:2], np.float32)
+TABLE_HALF = np.array(WIPING_TABLE[1], np.float32)
+TABLE_TOP = float(WIPING_TABLE[2] - WIPING_BASE[2])
 _PX, _PY = POINTS[:, 0], POINTS[:, 1]
 _BASIS = np.stack([np.ones_like(_PX), _PX, _PY, _PX**2, _PX * _PY, _PY**2])  # [6, P]
 
@@ -53,16 +58,24 @@ class Touch(NamedTuple):
     force: jax.Array
 
 
-def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
-    """Contact of the wiper's face with a table.
+def over_table(place: jax.Array) -> jax.Array:
+    """Which places [..., 2], m in the frame of the arm's base, lie over the table."""
+    return jnp.all(jnp.abs(place - TABLE_CENTRE) < TABLE_HALF, -1)
+
+
+def press(motion: Motion, start: jax.Array, friction: Friction = FRICTION) -> Touch:
+    """Contact of the wiper's face with the table; a point beyond its edge touches nothing.
 
     Args:
         motion: Motion of the arm without contact.
-        table: Height of the table's top above the arm's base, m.
         start: Acceleration to start from, rad/s^2: the last step's.
+        friction: Coefficient.
     """
     at = motion.at
-    height = at.position[2] - table + _PX * at.rotation[0][2] + _PY * at.rotation[1][2]
+    x, y = at.rotation[0], at.rotation[1]
+    place = jnp.stack([at.position[k] + _PX * x[k] + _PY * y[k] for k in range(2)], -1)
+    height = at.position[2] - TABLE_TOP + _PX * x[2] + _PY * y[2]
+    height = jnp.where(over_table(place), height, 1.0)
     reported = DEPTH_SCALE * jnp.maximum(-height, 0.0)
     d = impedance(reported, *IMPEDANCE)
     weight = jnp.where(height < 0, d / ((1 - d) * INVERSE_WEIGHT), 0.0)  # 1/R, kg
@@ -81,7 +94,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
     rest = _DAMPING * rows(speed) - jnp.stack([jnp.zeros_like(spring)] * 2 + [spring])
 
     def improve(a: jax.Array) -> jax.Array:
-        force, hessian = cone(rows(a) + rest, weight, FRICTION)
+        force, hessian = cone(rows(a) + rest, weight, friction)
         moments = (force @ _BASIS[:3].T).T.reshape(9)
         matrix = mass + fields.T @ _spread(hessian @ _BASIS.T) @ fields
         residual = fields.T @ moments - mass @ (a - free)
@@ -90,7 +103,7 @@ def press(motion: Motion, table: jax.Array | float, start: jax.Array) -> Touch:
     a = jnp.where(jnp.any(height < 0), start, free)
     for _ in range(ITERATIONS):
         a = jax.lax.optimization_barrier(improve(a))
-    return Touch(a, jnp.sum(cone_force(rows(a) + rest, weight, FRICTION), -1))
+    return Touch(a, jnp.sum(cone_force(rows(a) + rest, weight, friction), -1))
 
 
 def _fields(motion: Motion) -> jax.Array:
