@@ -115,6 +115,7 @@ LINKS = (
         inertia=(9.90863e-5, 1.32134e-4, 9.90863e-5),
     ),
 )
+ARM_JOINTS = tuple(f"joint_{index}" for index in range(len(LINKS)))
 HAND = (0.0, 0.098, 0.0)  # of the hand's frame in wrist 3's; turned by -90 degrees about x
 ARMATURE = tuple(5.0 / (index + 1) for index in range(6))
 DAMPING = 0.001  # N m s, every arm joint

@@ -1,0 +1,87 @@
+"""Table wiping on MJX: the twin's MJCF, with the table's edge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.manipulation.control.on_mjx import OperationalSpace
+from envs.manipulation.physics.mjx.scene import Scene
+from envs.manipulation.physics.mujoco_c import import_mujoco, wiping_xml
+from envs.manipulation.randomisation import NOMINAL, Factors
+from envs.manipulation.scenes.model import (
+    ARM_JOINTS,
+    FRICTION_LOSS,
+    TORQUE_LIMIT,
+    WIPER,
+    WIPING_TABLE,
+)
+from envs.manipulation.tasks.wiping import Moved, WipingState
+
+ITERATIONS = 8  # of the contact solver, at most
+
+
+def without_air(text: str) -> Any:
+    """The `MjSpec` of an arm's scene without drag: the controller adds the tool's alone."""
+    spec = import_mujoco().MjSpec.from_string(text)
+    spec.option.density = spec.option.viscosity = 0.0
+    spec.option.iterations = ITERATIONS
+    return spec
+
+
+class WipingMjx:
+    """25 steps of 2 ms with the exact set of 56 contact points."""
+
+    name = "mjx"
+    sequential_on_cpu = False
+
+    def __init__(self, solver: str | None = None):
+        """Compile the scene.
+
+        Args:
+            solver: Of contacts; see `Scene`.
+        """
+        (x, y), half, _ = WIPING_TABLE
+        self.centre, self.half = np.array([x, y], np.float32), np.array(half, np.float32)
+        self.scene = Scene(
+            without_air(wiping_xml(markers=0)), solver=solver, may_close=self.over_table
+        )
+        self.arm = OperationalSpace(
+            self.scene,
+            joints=ARM_JOINTS,
+            site="grip",
+            torque_limit=TORQUE_LIMIT,
+            friction=FRICTION_LOSS,
+            tool=WIPER,
+        )
+        self.points = self.scene.contacts("table", "point_")
+        self.wiper = self.scene.body("hand")
+
+    def advance(self, state: WipingState, action: jax.Array, factors: Factors = NOMINAL) -> Moved:
+        """The arm after one control step of 0.05 s; see `WipingAnalytic.advance`."""
+        scene, arm = self.scene, self.arm
+        put = scene.varied(factors, [self.wiper])
+        bodies = scene.start(state.joints).replace(qvel=state.speeds, warm=state.acceleration)
+        goal = arm.goal(scene.placed(bodies, put), action, state.goal_rotation.T)
+
+        def control(data: Any) -> Any:
+            return data.replace(qfrc_applied=arm.torque(data, goal, factors))
+
+        def sense(data: Any) -> tuple[jax.Array, jax.Array]:
+            return jnp.sum(scene.forces(data, self.points), 0), data.qacc
+
+        moved, (push, acceleration) = scene.advance(bodies, control, sense, put)
+        return Moved(
+            joints=moved.qpos,
+            speeds=moved.qvel,
+            acceleration=acceleration,
+            goal_rotation=goal.rotation.T,
+            push=push,
+        )
+
+    def over_table(self, contact: Any) -> jax.Array:
+        """Which contacts are not beyond the table's edge, [C]: MuJoCo's plane has none."""
+        return jnp.all(jnp.abs(contact.pos[:, :2] - self.centre) < self.half, -1)

@@ -1,0 +1,140 @@
+"""Constraint rows of a scene for `newton.py`, built from MJX's contacts and joints.
+
+What they contain is MJX's (`mjx._src.constraint`). Contacts with elliptic friction in the plane,
+of which a scene has dozens, are built here: their Jacobian is one product, where MJX walks the tree
+once per contact. The rest comes from `mjx.make_constraint`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.manipulation.physics.mjx.newton import DRY, ONE_SIDED, TWO_SIDED, Cones, Rows
+from envs.manipulation.physics.mjx.repairs import private
+from envs.manipulation.physics.mujoco_c import import_mujoco
+
+_LEAST, _MOST = 1e-4, 0.9999  # MuJoCo's mjMINIMP, mjMAXIMP
+_TINY = 1e-15  # mjMINVAL
+
+
+def elliptic_only(model: Any) -> bool:
+    """Whether `newton.py` can solve the scene: no torsion or rolling with elliptic cones.
+
+    Also excluded: a friction that differs between the two directions of the plane, and `solref` of
+    its own for friction, both of which only a `<pair>` can ask for.
+    """
+    mujoco = import_mujoco()
+    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return True
+    dims = np.concatenate([model.pair_dim, model.geom_condim])
+    uneven = np.any(model.pair_friction[:, 0] != model.pair_friction[:, 1])
+    return bool(np.all(np.isin(dims, (1, 3))) and not uneven and not model.pair_solreffriction.any())
+
+
+def moved_by(model: Any) -> np.ndarray:
+    """Whether a degree of freedom moves a body, [nbody, nv] of 0 and 1."""
+    table = np.zeros((model.nbody, model.nv), np.float32)
+    for body in range(1, model.nbody):
+        table[body] = table[model.body_parentid[body]]
+        first = model.body_dofadr[body]
+        table[body, first : first + model.body_dofnum[body]] = 1.0
+    return table
+
+
+def _stiffness(
+    put: Any, solref: jax.Array, solimp: jax.Array, position: jax.Array, plain: bool
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """MuJoCo's k, b and d of contacts, [C] each (`mjx._src.constraint._kbi`).
+
+    `plain` says that all powers of the impedance are 2.
+    """
+    low, high = (jnp.clip(solimp[:, i], _LEAST, _MOST) for i in (0, 1))
+    width, middle = jnp.maximum(_TINY, solimp[:, 2]), jnp.clip(solimp[:, 3], _LEAST, _MOST)
+    power = jnp.maximum(1.0, solimp[:, 4])
+    time, ratio = solref[:, 0], solref[:, 1]
+    soft = jnp.where(time > 0, time, 1.0)
+    if not put.opt.disableflags & import_mujoco().mjtDisableBit.mjDSBL_REFSAFE:
+        soft = jnp.maximum(soft, 2 * put.opt.timestep)
+    damp = jnp.where(ratio > 0, ratio, 1.0)
+    k = jnp.where(time <= 0, -time / (high * high), 1 / (high * soft * damp) ** 2)
+    b = jnp.where(ratio <= 0, -ratio / high, 2 / (high * soft))
+    x = jnp.abs(position) / width
+    if plain:
+        rise, fall = x * x / middle, (1 - x) * (1 - x) / (1 - middle)
+    else:
+        rise = jnp.power(x, power) / jnp.power(middle, power - 1)
+        fall = jnp.power(jnp.abs(1 - x), power) / jnp.power(1 - middle, power - 1)
+    d = low + jnp.where(x < middle, rise, 1 - fall) * (high - low)
+    d = jnp.where(x > 1.0, high, jnp.clip(d, low, high))
+    return k, b, d
+
+
+def cones(scene: Any, put: Any, data: Any) -> Cones | None:
+    """The contacts with friction in the plane, x and y tangents, z the normal."""
+    impl = data._impl
+    which = scene.cone_rows
+    if which is None:
+        return None
+    contact = jax.tree.map(lambda leaf: leaf[which], impl.contact) if scene.mixed else impl.contact
+    geoms = contact.geom if scene.pairs is None else scene.pairs[which]
+    first, second = (jnp.asarray(scene.model.geom_bodyid)[geoms[:, i]] for i in (0, 1))
+    if scene.pairs is not None:  # known before tracing
+        first, second = (scene.model.geom_bodyid[geoms[:, i]] for i in (0, 1))
+    sign = scene.moved_by[second] - scene.moved_by[first]  # [C, nv]
+    # a degree of freedom moves a point p at v + w x p, w and v seen at the world's origin
+    spin = data.cdof[:, :3]
+    at = data.subtree_com[scene.dof_root]
+    velocity = data.cdof[:, 3:] - jnp.cross(spin, at)
+    axes = jnp.moveaxis(contact.frame.reshape(-1, 3, 3), 1, 0)[np.array([1, 2, 0])]  # [3, C, 3]
+    turning = jnp.cross(contact.pos[None], axes)
+    twist = jnp.concatenate([velocity, spin], -1)  # [nv, 6]
+    jacobian = jnp.concatenate([axes, turning], -1) @ twist.T * sign
+    position = contact.dist - contact.includemargin
+    k, b, d = _stiffness(put, contact.solref, contact.solimp, position, scene.plain_powers)
+    inverse = put.body_invweight0[first, 0] + put.body_invweight0[second, 0]
+    weight = d / jnp.maximum(inverse * (1 - d), _TINY)
+    speed = jacobian @ data.qvel
+    reference = (-b * speed).at[2].add(-k * d * position)
+    return Cones(
+        jacobian=jacobian,
+        reference=reference,
+        weight=jnp.where(position < 0, weight, 0.0),
+        friction=contact.friction[:, 0],
+        ratio=scene.ratio,
+    )
+
+
+def rows(scene: Any, put: Any, data: Any) -> Rows | None:
+    """Equalities, dry friction, limits, contacts without friction, and edges of pyramids."""
+    if scene.row_kinds.size == 0:
+        return None
+    constraint = private("constraint")
+    if scene.cone_rows is not None:  # leave out what `cones` builds
+        only = np.where(data._impl.contact.dim == 1, 1, 0)
+        data = data.tree_replace({"_impl.contact.dim": only})
+    impl = constraint.make_constraint(put, data)._impl
+    acts = (scene.row_kinds != ONE_SIDED) | jnp.any(impl.efc_J != 0, -1)
+    return Rows(
+        jacobian=impl.efc_J,
+        reference=impl.efc_aref,
+        weight=jnp.where(acts, impl.efc_D, 0.0),
+        bound=impl.efc_frictionloss,
+        kind=scene.row_kinds,
+    )
+
+
+def kinds(put: Any, dims: np.ndarray, pyramids: bool) -> np.ndarray:
+    """Kind of each row of `rows`, [R], in MJX's order.
+
+    Args:
+        put: MJX's model.
+        dims: Of the contacts. pyramids: Whether their edges are rows too.
+    """
+    constraint = private("constraint")
+    only = dims if pyramids else np.where(dims == 1, 1, 0)
+    equalities, dry, limits, contacts = constraint.counts(constraint.make_efc_type(put, only))
+    return np.repeat([TWO_SIDED, DRY, ONE_SIDED], [equalities, dry, limits + contacts])
