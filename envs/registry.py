@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs.driving.card import DRIVING
 from envs.manipulation.cards import NUT_ASSEMBLY, TABLE_WIPING
-from ppl_jax.cards import DEFAULT, EnvCard, register_card
+from ppl_jax.cards import DEFAULT, EnvCard, card, register_card
 
 if TYPE_CHECKING:
     from ppl_jax.types import Env
@@ -61,9 +61,16 @@ def make(name: str, **options: Any) -> Env:
 
     The first one of a name is checked (`envs.check.check_env`).
 
+    Args:
+        name: Name.
+        **options: Of its maker. `physics` chooses among the engines that its card names; "auto"
+            goes with every environment.
+
     Raises:
-        ValueError: If no environment has that name, or what was built does not fit: one line.
+        ValueError: If no environment has that name, it has no such physics, or what was built does
+            not fit: one line.
     """
+    options = _with_physics(name, options)
     if name.startswith(BRAX):
         from envs.adapters.brax import make_brax
 
@@ -77,6 +84,26 @@ def make(name: str, **options: Any) -> Env:
         check_env(env, name)
         _CHECKED.add(name)
     return env
+
+
+def check_physics(name: str, physics: str) -> None:
+    """Refuse a physics that an environment does not have.
+
+    Raises:
+        ValueError: One line.
+    """
+    choices = card(name).physics
+    if physics != "auto" and physics not in choices:
+        allowed = f"auto or one of {', '.join(choices)}" if choices else "auto"
+        raise ValueError(f"physics must be {allowed} for {name!r}, got {physics!r}")
+
+
+def _with_physics(name: str, options: dict[str, Any]) -> dict[str, Any]:
+    physics = options.get("physics", "auto")
+    check_physics(name, physics)
+    if card(name).physics:
+        return options
+    return {key: value for key, value in options.items() if key != "physics"}
 
 
 def unknown(name: str) -> str:

@@ -44,6 +44,7 @@ class EnvCard:
         actions: Names of the action's components; () where they have none.
         view: How it is drawn: "road" from above, "arm" through MuJoCo; None where it cannot be.
         camera: Camera of an arm's view: lookat (m), distance (m), azimuth and elevation (degrees).
+        physics: Names of the physics engines that can run it; () where there is no choice.
         predictors: Names of its prediction steps.
         experts: Names of its experts.
         neural_expert: A neural expert is shipped.
@@ -65,6 +66,7 @@ class EnvCard:
     actions: tuple[str, ...] = ()
     view: Literal["road", "arm"] | None = None
     camera: Changes = dataclasses.field(default_factory=dict)
+    physics: tuple[str, ...] = ()
     predictors: tuple[str, ...] = ("simulator",)
     experts: tuple[str, ...] = ("scripted",)
     neural_expert: bool = False

@@ -3,6 +3,7 @@
 from ppl_jax.cards import EnvCard, ExpertCard
 
 _HAND = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
+_PHYSICS = ("analytic", "mjx", "mujoco_c")
 _MARKER = 1.64  # robosuite's normalised reward for one wiped marker
 
 # each expert starts as a clone of the scripted one, with little noise, and is improved gently
@@ -20,6 +21,7 @@ TABLE_WIPING = EnvCard(
     summary="A UR5e presses a wiper on a table until all dirt is gone (robosuite Wipe).",
     control_rate=20.0,
     actions=_HAND,
+    physics=_PHYSICS,
     view="arm",
     camera={"lookat": (0.05, 0.0, 0.95), "distance": 1.55, "azimuth": 215, "elevation": -38},
     neural_expert=True,
@@ -50,6 +52,7 @@ NUT_ASSEMBLY = EnvCard(
     summary="A UR5e lifts a ring by its handle and puts it on a peg (robosuite NutAssemblyRound).",
     control_rate=20.0,
     actions=(*_HAND, "gripper"),
+    physics=_PHYSICS,
     view="arm",
     camera={"lookat": (0.0, -0.08, 0.95), "distance": 1.25, "azimuth": 150, "elevation": -28},
     neural_expert=True,

@@ -38,6 +38,8 @@ def nut_xml() -> str:
         tips=gripper.TIPS,
         soft=soft,
         friction=grasp_contact.FRICTION,
+        knuckle_inertia=gripper.SERVO_INERTIA,
+        ring_damping=grasp_contact.RING_DAMPING,
     )
 
 

@@ -321,6 +321,8 @@ def nut_scene(
     tips: Mapping[str, Sequence[str]],
     soft: str,
     friction: float,
+    knuckle_inertia: float,
+    ring_damping: float,
 ) -> str:
     """MJCF of nut assembly.
 
@@ -333,6 +335,8 @@ def nut_scene(
             which meets the handle, and of the pad's lower edge, which meets the table.
         soft: solref and solimp, as MJCF attributes.
         friction: Friction of all contacts.
+        knuckle_inertia: Added to a knuckle's, kg m^2.
+        ring_damping: Of the ring's six speeds, N s/m and N m s.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""
@@ -344,7 +348,7 @@ def nut_scene(
         fingers += f"""
 <body name="{side}_knuckle" pos="0 {sign * 0.0306011} .054904" quat="{quat}">
   <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>
-  <joint name="{side}_knuckle" axis="1 0 0"/>
+  <joint name="{side}_knuckle" axis="1 0 0" armature="{knuckle_inertia:.12g}"/>
   <geom class="shown" type="capsule" fromto="0 0 0 0 .0376 .043" size=".009" rgba="{_STEEL}"/>
   <body name="{side}_finger" pos="0 .0376 .043">
     <geom class="shown" type="capsule" fromto="0 0 0 0 -.018 .022" size=".008" rgba="{_STEEL}"/>
@@ -367,7 +371,8 @@ def nut_scene(
         for i, place in enumerate(feet)
     )
     ring = f"""
-<body name="ring" pos="-.1125 -.16 .89"><freejoint name="ring"/>
+<body name="ring" pos="-.1125 -.16 .89"><joint name="ring" type="free"
+  damping="{ring_damping}"/>
   <inertial mass="{RING_MASS}" pos="{RING_CENTRE} 0 0" diaginertia="{_text(RING_INERTIA)}"/>
   {plates}{spheres}
   <geom name="handle" class="shown" type="box" pos="{_text(HANDLE)}" size="{_text(HANDLE_HALF)}"
