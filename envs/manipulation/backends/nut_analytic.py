@@ -26,9 +26,7 @@ class NutAnalytic:
     name = "analytic"
     sequential_on_cpu = True
 
-    def advance(
-        self, state: NutState, action: jax.Array, factors: Factors = NOMINAL
-    ) -> NutState:
+    def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:
         """The state after one control step of 0.05 s, contact flag included.
 
         On a CPU a batch goes one world after another: the contact solver is as fast with one as

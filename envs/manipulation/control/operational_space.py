@@ -194,9 +194,7 @@ def arm_torque(
         gain: Factor on the stiffness.
     """
     count = speeds.shape[0]
-    matrix = unrolled_linalg.materialize(
-        [[mass[i, j] for j in range(count)] for i in range(count)]
-    )
+    matrix = unrolled_linalg.materialize([[mass[i, j] for j in range(count)] for i in range(count)])
     factor = unrolled_linalg.materialize(unrolled_linalg.cholesky(matrix))
     columns = [(tuple(row[:3]), tuple(row[3:])) for row in jacobian]
     twist = speeds @ jacobian

@@ -197,7 +197,9 @@ def hold(
     gap, place, normal, tangent = (jnp.concatenate(parts) for parts in zip(*groups, strict=True))
     frame = jnp.stack([tangent, jnp.cross(normal, tangent), normal])  # [3, C, 3]
 
-    carried = _PADS + len(_EDGE)  # by a finger; the rest belong to the ring, and so do the pads' partners
+    carried = _PADS + len(
+        _EDGE
+    )  # by a finger; the rest belong to the ring, and so do the pads' partners
     site = jnp.stack(motion.at.position)
     linear = unrolled_linalg.array(part for part, _ in motion.columns)  # [6, 3]
     angular = unrolled_linalg.array(part for _, part in motion.columns)
@@ -236,8 +238,9 @@ def hold(
             lower = jnp.concatenate([by_mover[:, 8:].T, by_ring], -1)
             return jnp.concatenate([by_mover, lower])
 
-        return _newton(rows, rest, weight, mass, free=free, start=start, friction=friction,
-                       curvature=curvature)
+        return _newton(
+            rows, rest, weight, mass, free=free, start=start, friction=friction, curvature=curvature
+        )
 
     def apart() -> jax.Array:
         own = rows[:, carried:, 8:]

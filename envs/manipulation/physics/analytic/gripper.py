@@ -143,7 +143,5 @@ def pad_spheres(knuckles: Any, inner: Any) -> jax.Array:
     )
     edge_y = y[:, 0] - PAD_SPHERE * jnp.sin(knuckles)
     edge_z = z[:, 0] - PAD_SPHERE * jnp.cos(knuckles)
-    tips = [
-        jnp.stack([jnp.full(2, sign * PAD_HALF), edge_y, edge_z], -1) for sign in (-1.0, 1.0)
-    ]
+    tips = [jnp.stack([jnp.full(2, sign * PAD_HALF), edge_y, edge_z], -1) for sign in (-1.0, 1.0)]
     return jnp.concatenate([face, jnp.stack(tips, 1)], 1)

@@ -32,7 +32,9 @@ def elliptic_only(model: Any) -> bool:
         return True
     dims = np.concatenate([model.pair_dim, model.geom_condim])
     uneven = np.any(model.pair_friction[:, 0] != model.pair_friction[:, 1])
-    return bool(np.all(np.isin(dims, (1, 3))) and not uneven and not model.pair_solreffriction.any())
+    return bool(
+        np.all(np.isin(dims, (1, 3))) and not uneven and not model.pair_solreffriction.any()
+    )
 
 
 def moved_by(model: Any) -> np.ndarray:
