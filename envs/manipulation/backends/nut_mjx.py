@@ -35,7 +35,7 @@ class NutMjx:
         Args:
             solver: Of contacts; see `Scene`.
         """
-        scene = self.scene = Scene(without_air(nut_xml()), solver=solver)
+        scene = self.scene = Scene(without_air(nut_xml(edged=False)), solver=solver)
         self.arm = OperationalSpace(
             scene,
             joints=ARM_JOINTS,

@@ -47,7 +47,7 @@ class WipingMjx:
         (x, y), half, _ = WIPING_TABLE
         self.centre, self.half = np.array([x, y], np.float32), np.array(half, np.float32)
         self.scene = Scene(
-            without_air(wiping_xml(markers=0)), solver=solver, may_close=self.over_table
+            without_air(wiping_xml(markers=0, edged=False)), solver=solver, may_close=self.over_table
         )
         self.arm = OperationalSpace(
             self.scene,

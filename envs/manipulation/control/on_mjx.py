@@ -9,11 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control.operational_space import (
-    arm_torque,
-    joint_brake,
-    shifted,
-)
+from envs.manipulation.control.operational_space import applied_torque, arm_torque, shifted
 from envs.manipulation.physics.analytic.arm import drag
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.randomisation import NOMINAL, Factors
@@ -107,9 +103,15 @@ class OperationalSpace:
             posture=self.rest - data.qpos[self.qpos],
             gain=factors.gain,
         )
-        total = jnp.clip(total + data.qfrc_bias[dofs], -self.limit, self.limit)
-        if self.damping or self.friction:
-            total = total - factors.damping * joint_brake(speed, self.damping, self.friction)
+        total = applied_torque(
+            total,
+            data.qfrc_bias[dofs],
+            limit=self.limit,
+            speeds=speed,
+            damping=self.damping,
+            friction=self.friction,
+            factor=factors.damping,
+        )
         if self.tool is not None:
             twist = speed @ jacobian
             axes = data.site_xmat[self.site].T

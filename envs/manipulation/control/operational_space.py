@@ -214,6 +214,31 @@ def arm_torque(
     return jnp.stack(torque)
 
 
+def applied_torque(
+    task: jax.Array,
+    bias: jax.Array,
+    *,
+    limit: Any,
+    speeds: jax.Array,
+    damping: float,
+    friction: float,
+    factor: Scalar = 1.0,
+) -> jax.Array:
+    """What a motor applies, [J] N m: the task and the bias forces within its limit, less its brake.
+
+    Args:
+        task: [J] of `arm_torque`. bias: [J] gravity and what the speeds do.
+        limit: [J] N m.
+        speeds: [J] rad/s.
+        damping, friction: Of `joint_brake`, where the MJCF does not say them.
+        factor: On the brake.
+    """
+    total = jnp.clip(task + bias, -limit, limit)
+    if damping or friction:
+        total = total - factor * joint_brake(speeds, damping, friction)
+    return total
+
+
 def shifted(
     position: jax.Array, rotation: jax.Array, action: jax.Array, held: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -230,8 +230,15 @@ def _scene(bodies: str, pairs: str, extra: str = "") -> str:
 </mujoco>"""
 
 
-def _table(table: tuple[tuple[float, float], tuple[float, float], float]) -> str:
+def _table(
+    table: tuple[tuple[float, float], tuple[float, float], float], edged: bool = False
+) -> str:
     (x, y), (half_x, half_y), top = table
+    felt = (
+        f'type="box" pos="{x} {y} {top - 0.05}" size="{half_x} {half_y} .05"'
+        if edged
+        else f'type="plane" pos="{x} {y} {top}" size="{half_x} {half_y} .05"'
+    )
     legs = "".join(
         f'<geom class="shown" type="cylinder" size=".022 {(top - 0.05) / 2}" rgba="{_STEEL}" '
         f'pos="{x + sx * (half_x - 0.04)} {y + sy * (half_y - 0.04)} {(top - 0.05) / 2}"/>'
@@ -241,7 +248,7 @@ def _table(table: tuple[tuple[float, float], tuple[float, float], float]) -> str
     return f"""
 <geom class="shown" type="box" pos="{x} {y} {top - 0.025}" size="{half_x} {half_y} .025"
   material="table"/>{legs}
-<geom name="table" class="felt" type="plane" pos="{x} {y} {top}" size="{half_x} {half_y} .05"/>"""
+<geom name="table" class="felt" {felt}/>"""
 
 
 def _inertial(tool: Tool) -> str:
@@ -282,7 +289,9 @@ def arm_scene(
     return _scene(_arm(_inertial(tool) + held, base) + _table(table) + bodies, pairs)
 
 
-def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -> str:
+def wiping_scene(
+    points: np.ndarray, *, soft: str, friction: float, markers: int, edged: bool
+) -> str:
     """MJCF of table wiping.
 
     Args:
@@ -290,6 +299,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
         soft: solref and solimp of a point, as MJCF attributes.
         friction: Friction of the wiper on the table.
         markers: Number of spots of dirt (mocap bodies `marker_0` ...; drawn only).
+        edged: The table is a box; else it is a plane, which MuJoCo takes to be endless.
     """
     radius = 0.001
     spheres = "".join(
@@ -310,7 +320,7 @@ def wiping_scene(points: np.ndarray, soft: str, friction: float, markers: int) -
         'size=".02 .0006" rgba=".35 .22 .12 1"/></body>'
         for i in range(markers)
     )
-    return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
+    return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE, edged) + spots, pairs)
 
 
 def nut_scene(
@@ -323,6 +333,7 @@ def nut_scene(
     friction: float,
     knuckle_inertia: float,
     ring_damping: float,
+    edged: bool,
 ) -> str:
     """MJCF of nut assembly.
 
@@ -337,6 +348,7 @@ def nut_scene(
         friction: Friction of all contacts.
         knuckle_inertia: Added to a knuckle's, kg m^2.
         ring_damping: Of the ring's six speeds, N s/m and N m s.
+        edged: See `wiping_scene`.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""
@@ -401,4 +413,4 @@ def nut_scene(
         _pair(f"bead_{i}", f"bead_{i}", "peg", friction=friction, soft=soft)
         for i in range(len(beads))
     )
-    return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)
+    return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE, edged) + pegs + ring, pairs)
