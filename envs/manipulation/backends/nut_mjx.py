@@ -11,6 +11,7 @@ from envs.manipulation.backends.wiping_mjx import without_air
 from envs.manipulation.control.gripper_on_mjx import Fingers, TwoFingerGripper
 from envs.manipulation.control.on_mjx import OperationalSpace
 from envs.manipulation.physics.analytic.quaternion import rotation_matrix
+from envs.manipulation.physics.may_close import on_long_sides
 from envs.manipulation.physics.mjx.scene import Bodies, Scene
 from envs.manipulation.physics.mujoco_c import nut_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
@@ -35,7 +36,7 @@ class NutMjx:
         Args:
             solver: Of contacts; see `Scene`.
         """
-        scene = self.scene = Scene(without_air(nut_xml(edged=False)), solver=solver)
+        scene = self.scene = Scene(without_air(nut_xml()), solver=solver, may_close=on_long_sides)
         self.arm = OperationalSpace(
             scene,
             joints=ARM_JOINTS,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from envs.manipulation.control.on_mujoco_c import goal_of, torque
 from envs.manipulation.physics.analytic import gripper
 from envs.manipulation.physics.analytic.quaternion import rotation_matrix
+from envs.manipulation.physics.may_close import on_long_sides
 from envs.manipulation.physics.mujoco_c import MujocoC, MujocoState, nut_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import ARM_JOINTS, SUBSTEPS, TIMESTEP
@@ -33,6 +34,7 @@ class NutMujocoC:
             handled=["ring"],
             moved=[n for s in gripper.SIDES for n in (*gripper.PADS[s], *gripper.TIPS[s])],
             groups=[("handle", f"{side}_") for side in gripper.SIDES],
+            may_close=on_long_sides,
         )
 
     def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:

@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.manipulation.control.on_mjx import OperationalSpace
+from envs.manipulation.physics.may_close import over_wiping_table
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.physics.mujoco_c import import_mujoco, wiping_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
@@ -17,7 +17,6 @@ from envs.manipulation.scenes.model import (
     FRICTION_LOSS,
     TORQUE_LIMIT,
     WIPER,
-    WIPING_TABLE,
 )
 from envs.manipulation.tasks.wiping import Moved, WipingState
 
@@ -44,10 +43,8 @@ class WipingMjx:
         Args:
             solver: Of contacts; see `Scene`.
         """
-        (x, y), half, _ = WIPING_TABLE
-        self.centre, self.half = np.array([x, y], np.float32), np.array(half, np.float32)
         self.scene = Scene(
-            without_air(wiping_xml(markers=0, edged=False)), solver=solver, may_close=self.over_table
+            without_air(wiping_xml(markers=0)), solver=solver, may_close=over_wiping_table
         )
         self.arm = OperationalSpace(
             self.scene,
@@ -81,7 +78,3 @@ class WipingMjx:
             goal_rotation=goal.rotation.T,
             push=push,
         )
-
-    def over_table(self, contact: Any) -> jax.Array:
-        """Which contacts are not beyond the table's edge, [C]: MuJoCo's plane has none."""
-        return jnp.all(jnp.abs(contact.pos[:, :2] - self.centre) < self.half, -1)

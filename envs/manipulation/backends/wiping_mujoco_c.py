@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.manipulation.control.on_mujoco_c import goal_of, torque
+from envs.manipulation.physics.may_close import over_wiping_table
 from envs.manipulation.physics.mujoco_c import MujocoC, MujocoState, wiping_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import ARM_JOINTS, SUBSTEPS
@@ -25,6 +26,7 @@ class WipingMujocoC:
             joints=ARM_JOINTS,
             handled=["hand"],
             groups=[("table", "point_")],
+            may_close=over_wiping_table,
         )
 
     def advance(self, state: WipingState, action: jax.Array, factors: Factors = NOMINAL) -> Moved:

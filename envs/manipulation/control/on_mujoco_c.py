@@ -19,9 +19,7 @@ def goal_of(at: Measured, action: jax.Array, held: jax.Array) -> Goal:
     return shifted(at.position, at.rotation, action, held)
 
 
-def torque(
-    scene: MujocoC, state: MujocoState, goal: Goal, factors: Factors = NOMINAL
-) -> jax.Array:
+def torque(scene: MujocoC, state: MujocoState, goal: Goal, factors: Factors = NOMINAL) -> jax.Array:
     """Torque on all degrees of freedom, [nv] N m: the arm's motors, zero elsewhere.
 
     The joints' damping and the tool's drag are in the MJCF.

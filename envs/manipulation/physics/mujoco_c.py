@@ -1,4 +1,4 @@
-"""C MuJoCo under the same scenes, in double precision: the oracle, the third back end, and what draws.
+"""C MuJoCo in double precision under the same scenes: oracle, third back end, and what draws.
 
 Kinematics, dynamics, collision detection and contact solver are MuJoCo's own. A program reaches it
 by `jax.pure_callback`, one environment after another.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,7 @@ from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import nut_scene, wiping_scene
 
 
-def wiping_xml(markers: int = 100, edged: bool = True) -> str:
+def wiping_xml(markers: int = 100) -> str:
     """MJCF of table wiping with this package's contact parameters."""
     low, high, width = wipe_contact.IMPEDANCE
     stiff = wipe_contact.DEPTH_SCALE / wipe_contact.TIME_CONSTANT**2
@@ -33,11 +33,10 @@ def wiping_xml(markers: int = 100, edged: bool = True) -> str:
         soft=soft,
         friction=wipe_contact.FRICTION,
         markers=markers,
-        edged=edged,
     )
 
 
-def nut_xml(edged: bool = True) -> str:
+def nut_xml() -> str:
     """MJCF of nut assembly with this package's contact parameters."""
     d = grasp_contact.IMPEDANCE
     stiff, damp = grasp_contact.STIFF * d * d, grasp_contact.DAMP * d
@@ -51,7 +50,6 @@ def nut_xml(edged: bool = True) -> str:
         friction=grasp_contact.FRICTION,
         knuckle_inertia=gripper.SERVO_INERTIA,
         ring_damping=grasp_contact.RING_DAMPING,
-        edged=edged,
     )
 
 
@@ -65,6 +63,10 @@ def import_mujoco() -> Any:
         return importlib.import_module("mujoco")
     except ImportError as error:
         raise ImportError("this needs MuJoCo: pip install mujoco") from error
+
+
+MayClose = Callable[[Any, Any, Any], Any]
+"""`may_close(model, data, contact) -> [C]` of truth values, for MuJoCo's and for MJX's alike."""
 
 
 class MujocoState(NamedTuple):
@@ -122,6 +124,7 @@ class MujocoC:
         handled: Sequence[str] = (),
         moved: Sequence[str] = (),
         groups: Sequence[tuple[str, str]] = (),
+        may_close: MayClose | None = None,
     ):
         """Compile a scene.
 
@@ -132,6 +135,7 @@ class MujocoC:
             handled: Bodies whose mass a scenario changes.
             moved: Geoms whose places in their bodies are given at every step.
             groups: Beginnings of the names of the geoms of the contacts that are sensed.
+            may_close: Which contacts a step may close; all where None.
 
         Raises:
             ImportError: Without MuJoCo.
@@ -144,12 +148,14 @@ class MujocoC:
         self.dofs = np.array([int(model.joint(name).dofadr[0]) for name in joints])
         self._handled = np.array([model.body(name).id for name in handled], int)
         self._moved = np.array([model.geom(name).id for name in moved], int)
+        model.geom_sameframe[self._moved] = 0  # MuJoCo: "lies in its body's frame", found once
         self._nominal = {
             name: np.array(getattr(model, name))
             for name in ("geom_friction", "pair_friction", "dof_damping", "body_mass",
                          "body_inertia")
         }  # fmt: skip
         self._groups = self._table(groups)
+        self._may_close = may_close
         self._lock = threading.Lock()
 
     def _table(self, groups: Sequence[tuple[str, str]]) -> dict[tuple[int, int], tuple[int, int]]:
@@ -235,7 +241,7 @@ class MujocoC:
                     [np.asarray(leaf) for leaf in state], np.asarray(factors), np.asarray(places)
                 )
                 data.qfrc_applied[:] = np.asarray(torque)
-                self.mujoco.mj_step(self.model, data)
+                self._step()
                 touched = self._touched(groups)
                 after = MujocoState(_float(data.qpos), _float(data.qvel), _float(data.qacc))
                 return after, touched
@@ -250,6 +256,23 @@ class MujocoC:
             vmap_method="sequential",
         )
 
+    def _step(self) -> None:
+        """`mj_step` with Euler's integrator, and contacts that may not close left out."""
+        model, data, mujoco = self.model, self.data, self.mujoco
+        mujoco.mj_fwdPosition(model, data)
+        if self._may_close is not None and data.ncon:
+            closing = self._may_close(model, data, data.contact)
+            if not np.all(closing):
+                data.contact.exclude[:] = np.where(closing, data.contact.exclude, 1)
+                mujoco.mj_makeConstraint(model, data)
+                mujoco.mj_island(model, data)
+                mujoco.mj_projectConstraint(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        mujoco.mj_fwdConstraint(model, data)
+        mujoco.mj_Euler(model, data)
+
     def _touched(self, groups: int) -> Touched:
         model, data, mujoco = self.model, self.data, self.mujoco
         force, normal, closed = np.zeros((groups, 3)), np.zeros(groups), np.zeros(groups, bool)
@@ -257,7 +280,7 @@ class MujocoC:
         for index in range(data.ncon):
             contact = data.contact[index]
             found = self._groups.get((int(contact.geom1), int(contact.geom2)))
-            if found is None:
+            if found is None or contact.exclude:
                 continue
             group, sign = found
             mujoco.mj_contactForce(model, data, index, local)

@@ -30,8 +30,14 @@ NUT_TABLE = ((0.0, 0.0), (0.40, 0.40), 0.82)
 PEG = (0.23, -0.10, 0.85)  # centre of the round peg
 PEG_RADIUS, PEG_HALF = 0.02, 0.1
 RING_RADIUS, RING_BEAD = 0.0412, 0.01  # of the circle of beads that stand for the ring; a bead's
+# Where MuJoCo takes the inverse weight of a finger's contacts, in its knuckle's frame, m: 5.7 1/kg,
+# as in `grasp_contact`. The finger's mass (1 mg) means nothing there.
+_FELT_AT = (0.0, 0.0328, 0.2009)
 HANDLE = (0.06, 0.0, 0.0)  # of the handle's centre in the ring's frame
 HANDLE_HALF = (0.02525, 0.015875, 0.01)
+# Pads touch the handle's long sides alone (`physics.may_close`), and so deep (4 mm) that a sphere
+# near its edge would leave through another face: what is felt is wider.
+_FELT_HALF = (0.05, HANDLE_HALF[1], 0.03)
 RING_MASS = 0.0194067  # kg
 RING_CENTRE = 0.00991  # m from the ring's origin towards the handle
 RING_INERTIA = np.array([1.7213e-5, 2.72618e-5, 4.3181e-5])  # about its own axes, kg m^2
@@ -230,15 +236,8 @@ def _scene(bodies: str, pairs: str, extra: str = "") -> str:
 </mujoco>"""
 
 
-def _table(
-    table: tuple[tuple[float, float], tuple[float, float], float], edged: bool = False
-) -> str:
+def _table(table: tuple[tuple[float, float], tuple[float, float], float]) -> str:
     (x, y), (half_x, half_y), top = table
-    felt = (
-        f'type="box" pos="{x} {y} {top - 0.05}" size="{half_x} {half_y} .05"'
-        if edged
-        else f'type="plane" pos="{x} {y} {top}" size="{half_x} {half_y} .05"'
-    )
     legs = "".join(
         f'<geom class="shown" type="cylinder" size=".022 {(top - 0.05) / 2}" rgba="{_STEEL}" '
         f'pos="{x + sx * (half_x - 0.04)} {y + sy * (half_y - 0.04)} {(top - 0.05) / 2}"/>'
@@ -248,7 +247,7 @@ def _table(
     return f"""
 <geom class="shown" type="box" pos="{x} {y} {top - 0.025}" size="{half_x} {half_y} .025"
   material="table"/>{legs}
-<geom name="table" class="felt" {felt}/>"""
+<geom name="table" class="felt" type="plane" pos="{x} {y} {top}" size="{half_x} {half_y} .05"/>"""
 
 
 def _inertial(tool: Tool) -> str:
@@ -289,9 +288,7 @@ def arm_scene(
     return _scene(_arm(_inertial(tool) + held, base) + _table(table) + bodies, pairs)
 
 
-def wiping_scene(
-    points: np.ndarray, *, soft: str, friction: float, markers: int, edged: bool
-) -> str:
+def wiping_scene(points: np.ndarray, *, soft: str, friction: float, markers: int) -> str:
     """MJCF of table wiping.
 
     Args:
@@ -299,7 +296,6 @@ def wiping_scene(
         soft: solref and solimp of a point, as MJCF attributes.
         friction: Friction of the wiper on the table.
         markers: Number of spots of dirt (mocap bodies `marker_0` ...; drawn only).
-        edged: The table is a box; else it is a plane, which MuJoCo takes to be endless.
     """
     radius = 0.001
     spheres = "".join(
@@ -320,7 +316,7 @@ def wiping_scene(
         'size=".02 .0006" rgba=".35 .22 .12 1"/></body>'
         for i in range(markers)
     )
-    return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE, edged) + spots, pairs)
+    return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
 def nut_scene(
@@ -333,7 +329,6 @@ def nut_scene(
     friction: float,
     knuckle_inertia: float,
     ring_damping: float,
-    edged: bool,
 ) -> str:
     """MJCF of nut assembly.
 
@@ -348,7 +343,6 @@ def nut_scene(
         friction: Friction of all contacts.
         knuckle_inertia: Added to a knuckle's, kg m^2.
         ring_damping: Of the ring's six speeds, N s/m and N m s.
-        edged: See `wiping_scene`.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""
@@ -359,7 +353,7 @@ def nut_scene(
         quat = "1 0 0 0" if sign > 0 else "0 0 0 1"
         fingers += f"""
 <body name="{side}_knuckle" pos="0 {sign * 0.0306011} .054904" quat="{quat}">
-  <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>
+  <inertial mass="1e-6" pos="{_text(_FELT_AT)}" diaginertia="1e-9 1e-9 1e-9"/>
   <joint name="{side}_knuckle" axis="1 0 0" armature="{knuckle_inertia:.12g}"/>
   <geom class="shown" type="capsule" fromto="0 0 0 0 .0376 .043" size=".009" rgba="{_STEEL}"/>
   <body name="{side}_finger" pos="0 .0376 .043">
@@ -387,8 +381,9 @@ def nut_scene(
   damping="{ring_damping}"/>
   <inertial mass="{RING_MASS}" pos="{RING_CENTRE} 0 0" diaginertia="{_text(RING_INERTIA)}"/>
   {plates}{spheres}
-  <geom name="handle" class="shown" type="box" pos="{_text(HANDLE)}" size="{_text(HANDLE_HALF)}"
+  <geom class="shown" type="box" pos="{_text(HANDLE)}" size="{_text(HANDLE_HALF)}"
     rgba=".95 .60 .15 1"/>
+  <geom name="handle" class="felt" type="box" pos="{_text(HANDLE)}" size="{_text(_FELT_HALF)}"/>
 </body>"""
     pegs = f"""
 <geom name="peg" class="shown" type="cylinder" pos="{_text(PEG)}" size="{PEG_RADIUS} {PEG_HALF}"
@@ -413,4 +408,4 @@ def nut_scene(
         _pair(f"bead_{i}", f"bead_{i}", "peg", friction=friction, soft=soft)
         for i in range(len(beads))
     )
-    return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE, edged) + pegs + ring, pairs)
+    return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)

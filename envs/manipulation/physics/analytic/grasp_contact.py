@@ -19,6 +19,7 @@ import numpy as np
 from envs.manipulation.physics.analytic import gripper, unrolled_linalg
 from envs.manipulation.physics.analytic.arm import Motion
 from envs.manipulation.physics.analytic.contact import Friction, cone, cone_cost, cone_force
+from envs.manipulation.physics.may_close import DEEPEST
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
     HANDLE,
@@ -40,7 +41,6 @@ _TRIES = np.array([0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0], np.float32)  # shares 
 FRICTION = 1.0
 # of every contact: MuJoCo's solref 0.02 1 at an impedance between ring's and others'
 STIFF, DAMP, IMPEDANCE = 1 / (0.974 * 0.02) ** 2, 2 / (0.974 * 0.02), 0.96
-_DEEPEST = 0.005  # m: a point farther inside the handle came through another face
 _TABLE = NUT_TABLE[2] - NUT_BASE[2]
 _PEG = np.array([PEG[0] - NUT_BASE[0], PEG[1] - NUT_BASE[1]], np.float32)
 _PEG_TOP = PEG[2] + PEG_HALF - NUT_BASE[2]
@@ -128,7 +128,7 @@ def on_handle(pads: jax.Array, ring: Ring) -> _Points:
     side = jnp.where(local[:, 1] >= 0, 1.0, -1.0)
     gap = jnp.abs(local[:, 1]) - HANDLE_HALF[1]
     reach = (jnp.abs(local[:, 0]) < HANDLE_HALF[0]) & (jnp.abs(local[:, 2]) < HANDLE_HALF[2])
-    gap = jnp.where(reach & (gap > -_DEEPEST), gap, 1.0)
+    gap = jnp.where(reach & (gap > -DEEPEST), gap, 1.0)
     normal = side[:, None] * ring.rotation[:, 1]
     return _Points(
         gap=gap,

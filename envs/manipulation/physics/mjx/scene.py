@@ -13,7 +13,7 @@ import numpy as np
 from envs.manipulation.physics.mjx import newton, source
 from envs.manipulation.physics.mjx import rows as constraint_rows
 from envs.manipulation.physics.mjx.repairs import mjx, private
-from envs.manipulation.physics.mujoco_c import import_mujoco
+from envs.manipulation.physics.mujoco_c import MayClose, import_mujoco
 from envs.manipulation.randomisation import NOMINAL, Factors
 
 CONTROL_STEP = 0.05  # s
@@ -66,7 +66,7 @@ class Scene:
         control_step: float = CONTROL_STEP,
         solver: str | None = None,
         keep: Iterable[str] = (),
-        may_close: Callable[[Any], jax.Array] | None = None,
+        may_close: MayClose | None = None,
     ):
         """Parse, compile and check a scene.
 
@@ -76,8 +76,7 @@ class Scene:
             solver: "newton", "mjx", or None for "newton" where it can solve the scene (all but
                 elliptic cones with torsion or rolling, and uneven friction).
             keep: Names of geoms that touch nothing, but whose places are asked for.
-            may_close: `may_close(contact) -> [C]`, which of MJX's contacts a step may close; all
-                where None.
+            may_close: Which contacts a step may close; all where None.
 
         Raises:
             ValueError: One line, if the MJCF does not parse, the timestep does not divide the
@@ -296,7 +295,7 @@ class Scene:
         data = x.collision(put, data)
         if self._may_close is not None:
             contact = data._impl.contact
-            gap = jnp.where(self._may_close(contact), contact.dist, 1.0)
+            gap = jnp.where(self._may_close(self.model, data, contact), contact.dist, 1.0)
             data = data.tree_replace({"_impl.contact.dist": gap})
         moments = {}
         if self.model.nu:

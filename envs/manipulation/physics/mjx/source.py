@@ -1,4 +1,4 @@
-"""From a user's MJCF to the model that MJX runs: parsed, checked, and without what is only drawn."""
+"""From an MJCF to the model that MJX runs: parsed, checked, and without what is only drawn."""
 
 from __future__ import annotations
 
