@@ -29,3 +29,21 @@ def on_long_sides(model: Any, data: Any, contact: Any) -> Any:
     inside = (abs(local[:, 0]) < HANDLE_HALF[0]) & (abs(local[:, 2]) < HANDLE_HALF[2])
     elsewhere = (contact.geom[:, 0] != handle) & (contact.geom[:, 1] != handle)
     return elsewhere | (inside & (contact.dist > -DEEPEST))
+
+
+def over_table(table: tuple[tuple[float, float], tuple[float, float], float]) -> Any:
+    """A `may_close` for a scene of `scenes.model.arm_scene`: what meets the table meets its top.
+
+    Args:
+        table: Centre and half size of its top, m, and the height.
+    """
+    (x, y), half, _ = table
+
+    def may_close(model: Any, data: Any, contact: Any) -> Any:
+        del data
+        plane = model.geom("table").id
+        away = abs(contact.pos[:, :2] - np.array([x, y], np.float32))
+        elsewhere = (contact.geom[:, 0] != plane) & (contact.geom[:, 1] != plane)
+        return elsewhere | ((away[:, 0] < half[0]) & (away[:, 1] < half[1]))
+
+    return may_close

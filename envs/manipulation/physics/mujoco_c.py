@@ -36,17 +36,21 @@ def wiping_xml(markers: int = 100) -> str:
     )
 
 
-def nut_xml() -> str:
-    """MJCF of nut assembly with this package's contact parameters."""
+def grasp_softness() -> str:
+    """MJCF attributes solref and solimp of nut assembly's contacts."""
     d = grasp_contact.IMPEDANCE
     stiff, damp = grasp_contact.STIFF * d * d, grasp_contact.DAMP * d
-    soft = f'solref="{-stiff:.9g} {-damp:.9g}" solimp="{d} {d} 0.001"'
+    return f'solref="{-stiff:.9g} {-damp:.9g}" solimp="{d} {d} 0.001"'
+
+
+def nut_xml() -> str:
+    """MJCF of nut assembly with this package's contact parameters."""
     return nut_scene(
         grasp_contact.BEADS,
         grasp_contact.FEET,
         pads=gripper.PADS,
         tips=gripper.TIPS,
-        soft=soft,
+        soft=grasp_softness(),
         friction=grasp_contact.FRICTION,
         knuckle_inertia=gripper.SERVO_INERTIA,
         ring_damping=grasp_contact.RING_DAMPING,

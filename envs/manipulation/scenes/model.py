@@ -206,12 +206,15 @@ def _arm(tool: str, mount: tuple[float, float, float]) -> str:
 </body>"""
 
 
-def _scene(bodies: str, pairs: str, extra: str = "") -> str:
+def _scene(
+    bodies: str, pairs: str, extra: str = "", *, air: bool = True, iterations: int = 50
+) -> str:
+    density, viscosity = (AIR_DENSITY, AIR_VISCOSITY) if air else (0, 0)
     return f"""
 <mujoco model="ppl_jax">
   <compiler angle="radian" autolimits="true" inertiafromgeom="auto"/>
   <option timestep="{TIMESTEP}" integrator="Euler" cone="elliptic" impratio="20" solver="Newton"
-    gravity="0 0 -9.81" density="{AIR_DENSITY}" viscosity="{AIR_VISCOSITY}" iterations="50">
+    gravity="0 0 -9.81" density="{density}" viscosity="{viscosity}" iterations="{iterations}">
     <flag eulerdamp="disable"/>
   </option>
   <visual><headlight ambient=".45 .45 .45" diffuse=".55 .55 .55" specular=".1 .1 .1"/>
@@ -259,7 +262,15 @@ def _inertial(tool: Tool) -> str:
     )
 
 
-def _pair(name: str, first: str, second: str, *, friction: float, soft: str) -> str:
+def contact_pair(name: str, first: str, second: str, *, friction: float, soft: str) -> str:
+    """MJCF of two geoms that collide, as points with friction.
+
+    Args:
+        name: Of the pair.
+        first, second: Names of the geoms.
+        friction: Friction.
+        soft: solref and solimp, as MJCF attributes.
+    """
     return (
         f'<pair name="{name}" geom1="{first}" geom2="{second}" condim="3" '
         f'friction="{friction} {friction} 0 0 0" {soft}/>'
@@ -274,6 +285,8 @@ def arm_scene(
     held: str = "",
     bodies: str = "",
     pairs: str = "",
+    air: bool = True,
+    iterations: int = 50,
 ) -> str:
     """MJCF of a scene of one's own: the arm behind a table.
 
@@ -283,9 +296,17 @@ def arm_scene(
         table: Centre and half size of its top, m, and the height, m.
         held: MJCF of the tool's shapes, in the hand's frame. Class "shown" is drawn only.
         bodies: MJCF of what else is there.
-        pairs: MJCF of the contact pairs that C MuJoCo is to collide.
+        pairs: MJCF of the contact pairs that are to collide; see `contact_pair`.
+        air: Drag in air on every body. Without it, a controller that knows the tool adds the
+            tool's, which is nearly all of it.
+        iterations: Of the contact solver, at most.
     """
-    return _scene(_arm(_inertial(tool) + held, base) + _table(table) + bodies, pairs)
+    return _scene(
+        _arm(_inertial(tool) + held, base) + _table(table) + bodies,
+        pairs,
+        air=air,
+        iterations=iterations,
+    )
 
 
 def wiping_scene(points: np.ndarray, *, soft: str, friction: float, markers: int) -> str:
@@ -308,7 +329,7 @@ def wiping_scene(points: np.ndarray, *, soft: str, friction: float, markers: int
 <geom class="shown" type="box" pos="0 0 .004" size=".03 .03 .012" rgba="{_STEEL}"/>
 <geom class="shown" type="box" pos="0 0 .0225" size=".03 .06 .0075" rgba=".95 .75 .25 1"/>"""
     pairs = "".join(
-        _pair(f"press_{i}", "table", f"point_{i}", friction=friction, soft=soft)
+        contact_pair(f"press_{i}", "table", f"point_{i}", friction=friction, soft=soft)
         for i in range(len(points))
     )
     spots = "".join(
@@ -319,30 +340,18 @@ def wiping_scene(points: np.ndarray, *, soft: str, friction: float, markers: int
     return _scene(_arm(tool, WIPING_BASE) + _table(WIPING_TABLE) + spots, pairs)
 
 
-def nut_scene(
-    beads: np.ndarray,
-    feet: np.ndarray,
-    *,
-    pads: Mapping[str, Sequence[str]],
-    tips: Mapping[str, Sequence[str]],
-    soft: str,
-    friction: float,
-    knuckle_inertia: float,
-    ring_damping: float,
+def two_finger_gripper(
+    pads: Mapping[str, Sequence[str]], tips: Mapping[str, Sequence[str]], knuckle_inertia: float
 ) -> str:
-    """MJCF of nut assembly.
+    """MJCF of the shapes of `GRIPPER` in the hand: its body, and two fingers on knuckles.
 
     The inner fingers are fixed to the knuckles here; back ends move the pads' spheres, and drawing
     turns the fingers, as the gripper's state says.
 
     Args:
-        beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
         pads, tips: Names of the contact spheres of each finger, "left" and "right": of its pad,
-            which meets the handle, and of the pad's lower edge, which meets the table.
-        soft: solref and solimp, as MJCF attributes.
-        friction: Friction of all contacts.
+            and of the pad's lower edge.
         knuckle_inertia: Added to a knuckle's, kg m^2.
-        ring_damping: Of the ring's six speeds, N s/m and N m s.
     """
     sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
     fingers = ""
@@ -363,8 +372,34 @@ def nut_scene(
   </body>
   {points}
 </body>"""
-    tool = f"""{_inertial(GRIPPER)}
+    return f"""
 <geom class="shown" type="box" pos="0 0 .045" size=".03 .038 .042" rgba="{_STEEL}"/>{fingers}"""
+
+
+def nut_scene(
+    beads: np.ndarray,
+    feet: np.ndarray,
+    *,
+    pads: Mapping[str, Sequence[str]],
+    tips: Mapping[str, Sequence[str]],
+    soft: str,
+    friction: float,
+    knuckle_inertia: float,
+    ring_damping: float,
+) -> str:
+    """MJCF of nut assembly, with `two_finger_gripper` in the hand.
+
+    Args:
+        beads, feet: [B, 3], [F, 3] contact points of the ring in its frame, m.
+        pads, tips: Names of the contact spheres of each finger, "left" and "right": of its pad,
+            which meets the handle, and of the pad's lower edge, which meets the table.
+        soft: solref and solimp, as MJCF attributes.
+        friction: Friction of all contacts.
+        knuckle_inertia: Added to a knuckle's, kg m^2.
+        ring_damping: Of the ring's six speeds, N s/m and N m s.
+    """
+    sphere = '<geom name="{}" class="felt" type="sphere" size="{}" pos="{}"/>'
+    tool = _inertial(GRIPPER) + two_finger_gripper(pads, tips, knuckle_inertia)
     plates = "".join(
         f'<geom class="shown" type="box" size=".01125 .0225 .01" rgba=".95 .60 .15 1" '
         f'pos="{0.04245 * np.cos(a):.6g} {0.04245 * np.sin(a):.6g} 0" euler="0 0 {a:.6g}"/>'
@@ -391,21 +426,21 @@ def nut_scene(
 <geom class="shown" type="box" pos="{PEG[0]} {-PEG[1]} {PEG[2]}" size=".016 .016 .1"
   rgba=".6 .62 .65 1"/>"""
     pairs = "".join(
-        _pair(name, name, "handle", friction=friction, soft=soft)
+        contact_pair(name, name, "handle", friction=friction, soft=soft)
         for side in ("left", "right")
         for name in pads[side]
     )
     pairs += "".join(
-        _pair(name, "table", name, friction=friction, soft=soft)
+        contact_pair(name, "table", name, friction=friction, soft=soft)
         for side in ("left", "right")
         for name in tips[side]
     )
     pairs += "".join(
-        _pair(f"foot_{i}", "table", f"foot_{i}", friction=friction, soft=soft)
+        contact_pair(f"foot_{i}", "table", f"foot_{i}", friction=friction, soft=soft)
         for i in range(len(feet))
     )
     pairs += "".join(
-        _pair(f"bead_{i}", f"bead_{i}", "peg", friction=friction, soft=soft)
+        contact_pair(f"bead_{i}", f"bead_{i}", "peg", friction=friction, soft=soft)
         for i in range(len(beads))
     )
     return _scene(_arm(tool, NUT_BASE) + _table(NUT_TABLE) + pegs + ring, pairs)
