@@ -43,8 +43,11 @@ class TwoFingerGripper:
 
     Attributes:
         at, dofs: [2] places of the knuckles in `qpos` and `qvel`.
+        rest: [2] rad, the knuckles after a reset.
         contacts: Rows of the contacts of each pad with what it is to hold.
     """
+
+    rest = gripper.INITIAL[::3].astype(np.float32)
 
     def __init__(self, scene: Scene, holds: str):
         """Find the gripper in a scene.
@@ -64,13 +67,13 @@ class TwoFingerGripper:
         self.contacts = [scene.contacts(f"{side}_", holds) for side in gripper.SIDES]
 
     def opened(self) -> Fingers:
-        """The law's state after a reset."""
+        """The law's state after a reset: open, the command in its middle, as robosuite has it."""
         return Fingers(
             inner=jnp.asarray(gripper.INITIAL[1::3], jnp.float32),
             outer=jnp.asarray(gripper.INITIAL[2::3], jnp.float32),
             inner_speed=jnp.zeros(2),
             outer_speed=jnp.zeros(2),
-            command=jnp.full((), -1.0),
+            command=jnp.zeros(()),
             touching=jnp.zeros(2, bool),
         )
 

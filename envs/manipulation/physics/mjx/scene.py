@@ -260,6 +260,19 @@ class Scene:
         put = self.put if put is None else put
         return mjx().com_pos(put, mjx().kinematics(put, self.data(bodies)))
 
+    def _collided(self, put: Any, data: Any) -> Any:
+        data = mjx().collision(put, data)
+        if self._may_close is not None:
+            contact = data._impl.contact
+            gap = jnp.where(self._may_close(self.model, data, contact), contact.dist, 1.0)
+            data = data.tree_replace({"_impl.contact.dist": gap})
+        return data
+
+    def at_rest(self, bodies: Bodies, put: Any = None) -> Any:
+        """MJX's data of a start, as `sense` takes it: frames and contacts; forces are zero."""
+        put = self.put if put is None else put
+        return self._collided(put, self.placed(bodies, put))
+
     def varied(self, factors: Factors, handled: Sequence[int] = ()) -> Any:
         """MJX's model of a scenario: frictions, damping, and masses of the bodies `handled`."""
         if factors is NOMINAL:
@@ -292,11 +305,7 @@ class Scene:
         data = x.crb(put, data)
         if self.model.ntendon:
             data = private("smooth").tendon_armature(put, data)
-        data = x.collision(put, data)
-        if self._may_close is not None:
-            contact = data._impl.contact
-            gap = jnp.where(self._may_close(self.model, data, contact), contact.dist, 1.0)
-            data = data.tree_replace({"_impl.contact.dist": gap})
+        data = self._collided(put, data)
         moments = {}
         if self.model.nu:
             data = x.transmission(put, data)
