@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from envs.driving.card import DRIVING
-from envs.manipulation.cards import NUT_ASSEMBLY, TABLE_WIPING
+from envs.manipulation.cards import LIFT, NUT_ASSEMBLY, TABLE_WIPING
 from ppl_jax.cards import DEFAULT, EnvCard, card, register_card
 
 if TYPE_CHECKING:
@@ -126,5 +126,6 @@ def _shipped(module: str, maker: str) -> Callable[..., Env]:
 
 _ARM = "envs.manipulation.make"
 register("driving", _shipped("envs.driving.make", "make_driving"), DRIVING, checked=True)
+register("lift", _shipped(_ARM, "make_lift"), LIFT, checked=True)
 register("nut_assembly", _shipped(_ARM, "make_nut_assembly"), NUT_ASSEMBLY, checked=True)
 register("table_wiping", _shipped(_ARM, "make_table_wiping"), TABLE_WIPING, checked=True)

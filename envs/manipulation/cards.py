@@ -74,3 +74,24 @@ NUT_ASSEMBLY = EnvCard(
         hparams={**_HPARAMS, "success_bonus": 100.0},
     ),
 )
+
+LIFT = EnvCard(
+    title="Lift",
+    summary="A UR5e lifts a cube from a table (robosuite Lift).",
+    control_rate=20.0,
+    actions=(*_HAND, "gripper"),
+    physics=("mjx",),
+    view="arm",
+    camera={"lookat": (-0.05, -0.02, 0.92), "distance": 1.1, "azimuth": 150, "elevation": -25},
+    demonstrations=10_000,
+    warm_up=300,
+    settings={
+        "total_steps": 5000,
+        "gate": "deviates_from_expert",
+        "max_preference_horizon": 6,
+        "preference_horizon": 6,
+    },
+    missing_presets=("reference",),
+    step_ms=30.0,
+    compile_s=120.0,
+)

@@ -7,13 +7,11 @@ from typing import Any
 
 import jax
 
+from envs.manipulation.experts import lift as lift_experts
 from envs.manipulation.experts import nut as nut_experts
 from envs.manipulation.experts import wiping as wiping_experts
-from envs.manipulation.tasks import nut, wiping
-from envs.manipulation.tasks.base import Backend
-
-TRAINING_SCENARIOS = range(1000)
-HELD_OUT_SCENARIOS = range(1000, 1050)
+from envs.manipulation.tasks import lift, nut, wiping
+from envs.manipulation.tasks.base import HELD_OUT_SCENARIOS, TRAINING_SCENARIOS, Backend
 
 # imported when they are built: MuJoCo and MJX take seconds
 _BACKENDS = {
@@ -86,3 +84,24 @@ def make_nut_assembly(
     experts = {"scripted": nut_experts.scripted_expert}
     backend = make_backend("nut_assembly", physics)
     return nut.NutAssembly(nut.make_params(training), nut.make_params(held_out), experts, backend)
+
+
+def make_lift(
+    training: range = TRAINING_SCENARIOS,
+    held_out: range = HELD_OUT_SCENARIOS,
+    *,
+    physics: str = "auto",
+) -> lift.Lift:
+    """Build lift.
+
+    Args:
+        training, held_out: Numbers of the scenarios to train and to evaluate on.
+        physics: "auto" or "mjx", which is all it has.
+
+    Raises:
+        ValueError: If `physics` is another.
+        ImportError: Without MuJoCo XLA.
+    """
+    if physics not in ("auto", "mjx"):
+        raise ValueError(f"physics must be auto or mjx, got {physics!r}")
+    return lift.Lift(training, held_out, experts={"scripted": lift_experts.scripted_expert})

@@ -24,6 +24,9 @@ from envs.manipulation.randomisation import (
 from envs.manipulation.scenes.model import TIMESTEP, Tool
 from ppl_jax.types import Expert
 
+TRAINING_SCENARIOS = range(1000)
+HELD_OUT_SCENARIOS = range(1000, 1050)
+
 
 class Backend(Protocol):
     """The physics of a task.
