@@ -145,8 +145,8 @@ class Scene:
             placed = mjx().kinematics(self.put, self._blank)
             return mjx().collision(self.put, placed)._impl.contact.geom
 
-        with jax.ensure_compile_time_eval():
-            return np.asarray(jax.jit(geoms)())
+        # as one program, of which the compiler keeps the constant alone
+        return np.asarray(jax.jit(geoms)())
 
     # ---- names
 
