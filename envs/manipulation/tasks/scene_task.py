@@ -298,16 +298,23 @@ class SceneTask(ArmTask):
         """The state after the physics steps of one control step; its time is the old one."""
         scene, arm, gripper = self.scene, self.arm, self.gripper
         put, bodies = scene.varied(factors, self._handled), state.bodies
-        goal = arm.goal(scene.placed(bodies, put), action, state.held)
         if gripper is None and bodies.ctrl is not None and action.shape[0] > MOTION:
             share = (1 + jnp.broadcast_to(action[MOTION:], self._low.shape)) / 2
             ctrl = self._low + (self._high - self._low) * share
             bodies = dataclasses.replace(bodies, ctrl=ctrl)
 
-        def torque(data: Any) -> jax.Array:
-            return self._torque(data, goal, factors)
+        def aimed(data: Any, goal: Goal, first: jax.Array) -> Goal:
+            """The goal of the control step, from the frames of its first physics step."""
+            new = arm.goal(data, action, state.held)
+            return jax.tree.map(lambda a, b: jnp.where(first, a, b), new, goal)
 
-        def step(bodies: Bodies, fingers: Any) -> Any:
+        def step(carry: Any, first: jax.Array) -> tuple[Any, None]:
+            bodies, fingers, goal, _, _ = carry
+
+            def torque(data: Any) -> jax.Array:
+                own = arm.torque(data, aimed(data, goal, first), factors)
+                return jnp.zeros_like(data.qvel).at[arm.dofs].set(own)
+
             if gripper is None:
                 data = scene.step(
                     scene.data(bodies), lambda data: data.replace(qfrc_applied=torque(data)), put
@@ -317,21 +324,16 @@ class SceneTask(ArmTask):
                 bodies, fingers, data = gripper.step(
                     bodies, fingers, action=action[MOTION], torque=torque, put=put
                 )
-            return bodies, fingers, self._site(data), self.sense(data)
+            goal = aimed(data, goal, first)
+            return (bodies, fingers, goal, self._site(data), self.sense(data)), None
 
-        carry = (bodies, state.fingers, state.site, state.sensed)
-        moved, _ = jax.lax.scan(
-            lambda carry, _: (step(*carry[:2]), None), carry, None, length=scene.substeps
-        )
-        bodies, fingers, site, sensed = moved
+        begun = Goal(jnp.zeros(3), state.held)
+        carry = (bodies, state.fingers, begun, state.site, state.sensed)
+        carry, _ = jax.lax.scan(step, carry, np.arange(scene.substeps) == 0)
+        bodies, fingers, goal, site, sensed = carry
         return dataclasses.replace(
             state, bodies=bodies, held=goal.rotation, fingers=fingers, site=site, sensed=sensed
         )
-
-    def _torque(self, data: Any, goal: Goal, factors: Factors) -> jax.Array:
-        """The arm's torques among all degrees of freedom, [nv] N m."""
-        own = self.arm.torque(data, goal, factors)
-        return jnp.zeros_like(data.qvel).at[self.arm.dofs].set(own)
 
 
 def _floats(state: Any) -> list[jax.Array]:
