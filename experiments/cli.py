@@ -183,7 +183,7 @@ def _evaluate(command: Evaluate) -> None:
     from experiments.report.tables import print_evaluation
 
     start_jax()
-    rows = evaluate_run(command.run, command.scenarios)
+    rows = evaluate_run(command.run, command.scenarios, command.physics)
     if command.out is not None:
         from experiments.report.tables import write_rows
 
@@ -296,7 +296,8 @@ def _expert_evaluate(command: ExpertEvaluate) -> None:
     from experiments.report.tables import print_evaluation, write_rows
 
     start_jax()
-    options = {} if command.scenarios is None else {"held_out_scenarios": command.scenarios}
+    given = {"held_out_scenarios": command.scenarios, "physics": command.physics}
+    options = {name: value for name, value in given.items() if value is not None}
     rows = evaluate_expert(make_env(command.env, options), command.kind)
     if command.out is not None:
         write_rows(command.out, [row._asdict() for row in rows])
@@ -319,7 +320,14 @@ def _render(command: Render) -> None:
     from experiments.report.film import render
 
     start_jax()
-    render(command.run, command.scenario, command.out, command.steps, env_name=command.env)
+    render(
+        command.run,
+        command.scenario,
+        command.out,
+        command.steps,
+        env_name=command.env,
+        physics=command.physics,
+    )
     print(f"wrote {command.out}")
 
 

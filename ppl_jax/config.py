@@ -104,6 +104,13 @@ class TrainConfig:
         low=0,
         group="run",
     )
+    physics: str = setting(
+        "auto",
+        "Physics engine of the environment: auto, analytic, mjx or mujoco_c; `ppl list` says "
+        "which of them.",
+        group="run",
+        common=True,
+    )
     prediction_horizon: int = setting(
         10, "H: steps of the lookahead that the expert sees.", low=1, group="predictor", common=True
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,7 +143,13 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
     except ValueError as error:
         raise UserError(str(error)) from error
     names = ("scenarios", "held_out_scenarios")
-    return config["env"], {name: config[name] for name in names if config[name] is not None}
+    options = {name: config[name] for name in names if config[name] is not None}
+    return config["env"], {"physics": run_physics(config), **options}
+
+
+def run_physics(config: Mapping[str, Any]) -> str:
+    """The physics that a config.json of any kind of run names; "auto" where it is older."""
+    return {**config, **config.get("settings", {})}.get("physics", "auto")
 
 
 def run_spec(run: Path) -> EnvSpec:
@@ -152,11 +159,21 @@ def run_spec(run: Path) -> EnvSpec:
 
 
 def make_env(name: str, options: dict[str, Any]) -> Env:
-    """Build an environment; a mistake becomes a `UserError`."""
+    """Build an environment; a mistake, or a physics that is not installed, is a `UserError`."""
     try:
         return make(name, **options)
     except ValueError as error:
         raise UserError(str(error)) from error
+    except ImportError as error:
+        if options.get("physics", "auto") == "auto":
+            raise
+        raise UserError(f"physics {options['physics']!r} cannot be used here: {error}") from error
+
+
+def physics_of(env: Env) -> dict[str, str]:
+    """For a summary: the physics that runs the environment, where it has a choice."""
+    name = getattr(env, "physics", None)
+    return {} if name is None else {"physics": name}
 
 
 def named_expert(name: str, env: Env) -> Expert:
@@ -196,15 +213,25 @@ def read_policy(path: str | Path, spec: EnvSpec) -> SavedPolicy:
         raise UserError(str(error)) from error
 
 
-def evaluate_run(run: Path, scenarios: str | None) -> list[EvaluationRow]:
-    """Play a run's held-out scenarios, or those of a folder of recordings, once.
+def evaluate_run(
+    run: Path, scenarios: str | None, physics: str | None = None
+) -> list[EvaluationRow]:
+    """Play a run's held-out scenarios once.
+
+    Args:
+        run: Run folder or policy file.
+        scenarios: Folder of recordings to play instead.
+        physics: To play in; the run's own where None.
 
     Raises:
-        UserError: If run, policy or folder cannot be used.
+        UserError: If run, policy, folder or physics cannot be used.
     """
     source = policy_path(run)
     name, options = run_options(run)
     if scenarios is not None:
-        options = {"held_out_scenarios": scenarios}
+        options = {k: v for k, v in options.items() if k == "physics"}
+        options["held_out_scenarios"] = scenarios
+    if physics is not None:
+        options["physics"] = physics
     env = make_env(name, options)
     return evaluate_policy(env, read_policy(source, env.spec), 0)

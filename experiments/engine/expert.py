@@ -16,6 +16,7 @@ from experiments.engine.evaluate import (
     evaluate_policy,
     make_env,
     named_policy,
+    physics_of,
     read_evaluation,
     rows_of,
     summarise_episodes,
@@ -44,10 +45,11 @@ def build_env(settings: ExpertSettings) -> Env:
     """The environment that an expert trains in.
 
     Raises:
-        UserError: If a scenario folder cannot be used.
+        UserError: If a scenario folder or the physics cannot be used.
     """
     names = ("scenarios", "held_out_scenarios")
-    options = {name: v for name in names if (v := getattr(settings, name)) is not None}
+    options: dict[str, Any] = {"physics": settings.physics}
+    options |= {name: v for name in names if (v := getattr(settings, name)) is not None}
     if settings.training_scenarios:
         options["training"] = range(FIRST_SCENARIO, FIRST_SCENARIO + settings.training_scenarios)
     return make_env(settings.env, options)
@@ -215,6 +217,7 @@ class _Run:
             **summarise_episodes([row for row in rows if row.step == steps]),
             "multiplier": float(learner.learned.multiplier.value),
             "diverged": bool(learner.diverged),
+            **physics_of(self.env),
             "wall_s": round(wall_s, 1),
             "compile_s": round(self.compile_s, 1),
             "steps_per_s": round(self.trained / max(self.train_s, 1e-9), 1),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.registry import known, unknown
+from envs.registry import check_physics, known, unknown
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import MAX_SEED, SCHEMA, schema_of
@@ -30,6 +30,7 @@ class ExpertSettings:
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
         training_scenarios: Number of generated scenarios to train on; 0 for the environment's own.
         evaluate_every: Batches between evaluations and checkpoints.
+        physics: Physics engine of the environment.
     """
 
     env: str
@@ -40,6 +41,7 @@ class ExpertSettings:
     held_out_scenarios: str | None = None
     training_scenarios: int = 0
     evaluate_every: int = 1
+    physics: str = "auto"
 
     def as_json(self) -> dict[str, Any]:
         """For config.json."""
@@ -137,6 +139,7 @@ def check(settings: ExpertSettings) -> None:
     if settings.training_scenarios and settings.scenarios is not None:
         raise UserError("training_scenarios is for generated scenarios: give it, or --scenarios")
     try:
+        check_physics(settings.env, settings.physics)
         validate(settings.config, settings.hparams)
     except ValueError as error:
         raise UserError(str(error)) from error

@@ -20,6 +20,7 @@ from experiments.engine.evaluate import (
     evaluate_policy,
     make_env,
     named_expert,
+    physics_of,
     read_evaluation,
     read_policy,
     summarise_episodes,
@@ -58,14 +59,14 @@ def build_env(settings: RunSettings) -> Env:
     """The environment of a run.
 
     Raises:
-        UserError: If a scenario folder cannot be used.
+        UserError: If a scenario folder or the physics cannot be used.
     """
     options = {
         name: value
         for name in ("scenarios", "held_out_scenarios")
         if (value := getattr(settings, name)) is not None
     }
-    return make_env(settings.env, options)
+    return make_env(settings.env, {"physics": settings.config.physics, **options})
 
 
 def algorithm_factory(settings: RunSettings, env: Env) -> algorithms.MakeAlgorithm:
@@ -332,7 +333,7 @@ class _Runner:
 
             began = time.perf_counter()
             jitted = jax.jit(run, donate_argnums=0)
-            what = f"{self.settings.algorithm} in {self.settings.env}, {chunk.phase}"
+            what = f"{self.settings.algorithm} in {self.settings.where}, {chunk.phase}"
             with self.progress.compiling(what, f"{what}, {chunk.length} steps"):
                 self.programs[kind] = jitted.lower(learner).compile()
             self.compile_s += time.perf_counter() - began
@@ -401,6 +402,7 @@ class _Runner:
             "training_cost": float(learner.counters.cost),
             "physics_diverged_episodes": int(learner.counters.physics_diverged),
             "diverged": bool(learner.diverged),
+            **physics_of(self.env),
             "wall_s": round(wall_s, 1),
             "compile_s": round(self.compile_s, 1),
             "steps_per_s": round(self.trained_steps / max(self.train_s, 1e-9), 1),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.registry import known, unknown
+from envs.registry import check_physics, known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values
@@ -26,6 +26,7 @@ RENAMED = {
 RENAMED_VALUES = {
     "gate": {"departs": "deviates_from_expert", "unlikely": "action_probability"},
 }
+ADDED = {"physics": "auto"}  # settings that older files lack, and the value those runs had
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +55,12 @@ class RunSettings:
     held_out_scenarios: str | None = None
     evaluate_every: int = 1000
     evaluate_on: str = "held_out"
+
+    @property
+    def where(self) -> str:
+        """Its environment for messages, with the physics where one was asked for."""
+        physics = self.config.physics
+        return self.env if physics == "auto" else f"{self.env} on {physics}"
 
     def as_json(self) -> dict[str, Any]:
         """For config.json."""
@@ -141,7 +148,7 @@ def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in content.items():
         nested = isinstance(value, dict) and name in ("settings", "config", "hparams")
         flat_content |= value if nested else {name: value}
-    return flat_content
+    return ADDED | flat_content if of_a_method else flat_content
 
 
 def refuse_contradictions(out: Any, held: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
@@ -262,6 +269,7 @@ def check(settings: RunSettings) -> None:
         raise UserError(f"seed must {allowed}, got {settings.seed}")
     interval = settings.config.decision_interval
     try:
+        check_physics(settings.env, settings.config.physics)
         algorithms.method(settings.algorithm)
         validate(settings.config, settings.hparams)
     except ValueError as error:

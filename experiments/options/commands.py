@@ -21,6 +21,8 @@ class Evaluate:
     """Run folder, or an exported policy file."""
     scenarios: str | None = None
     """Folder of recorded scenarios to play instead of the run's own held-out ones."""
+    physics: str | None = None
+    """Physics engine of the environment (default: the run's own); `ppl list` names them."""
     out: Path | None = None
     """Write one row per scenario to this CSV file."""
 
@@ -50,6 +52,8 @@ class Compare:
     """Gate action_probability: log-density under a neural expert below which it takes over."""
     batch_size: int | None = None
     """Samples per loss and update."""
+    physics: str | None = None
+    """Physics engine of the environment (default: auto); `ppl list` names them."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
     scenarios: str | None = None
@@ -81,6 +85,8 @@ class Ablation:
     """Steps between evaluations (default: a tenth of the run)."""
     batch_size: int | None = None
     """Samples per loss and update."""
+    physics: str | None = None
+    """Physics engine of the environment (default: auto); `ppl list` names them."""
     preset: Literal["default", "paper", "reference"] = "default"
     """Settings to start from."""
     expert: str | None = None
@@ -110,6 +116,8 @@ class Tune:
     """Environment steps of gail."""
     batch_size: int | None = None
     """Samples per loss and update."""
+    physics: str | None = None
+    """Physics engine of the environment (default: auto); `ppl list` names them."""
     expert: str | None = None
     """scripted (the default), neural (the shipped one), or a policy file or run folder."""
     processes: int = 2
@@ -137,6 +145,8 @@ class ExpertEvaluate:
     """neural (the shipped one), scripted, or a policy file or run folder."""
     scenarios: str | None = None
     """Folder of recorded scenarios to play instead of the held-out ones."""
+    physics: str | None = None
+    """Physics engine of the environment (default: auto); `ppl list` names them."""
     out: Path | None = None
     """Write one row per scenario to this CSV file."""
 
@@ -247,6 +257,8 @@ class Horizon:
     """Steps between measurements (default: a fifth of the run)."""
     batch_size: int | None = None
     """Samples per loss and update."""
+    physics: str | None = None
+    """Physics engine of the environment (default: auto); `ppl list` names them."""
     expert: str = "scripted"
     """scripted, neural (the shipped one), or a policy file or run folder."""
     out: Path = Path("horizon.csv")
@@ -324,6 +336,8 @@ class Render:
     """Most steps to draw."""
     env: str = "driving"
     """Environment of "scripted" and "neural"."""
+    physics: str | None = None
+    """Physics engine of the environment (default: the run's own or auto); `ppl list` names them."""
 
 
 @hide_unset

@@ -47,6 +47,7 @@ _OWN: dict[str, list[tuple[str, Any, str]]] = {
             "Generated scenarios to train on, numbered from 10,000; 0 for the novice's.",
         ),
         ("scenarios", str | None, "Folder of recorded scenarios to train on instead."),
+        ("physics", str, "Physics engine of the environment; `ppl list` names them."),
     ],
     "evaluation": [
         (

@@ -26,7 +26,15 @@ Draw = Callable[[Any, np.ndarray, bool, np.ndarray, str], np.ndarray]
 """`draw(state, novice's path, takeover, expert's path, caption) -> picture`."""
 
 
-def render(run: str, number: int, out: Path, steps: int, *, env_name: str = "driving") -> None:
+def render(
+    run: str,
+    number: int,
+    out: Path,
+    steps: int,
+    *,
+    env_name: str = "driving",
+    physics: str | None = None,
+) -> None:
     """Play a held-out scenario and write the film.
 
     Args:
@@ -35,6 +43,7 @@ def render(run: str, number: int, out: Path, steps: int, *, env_name: str = "dri
         out: .gif, .mp4 or .png (the last picture).
         steps: Most steps to draw.
         env_name: Environment, where `run` is "scripted" or "neural".
+        physics: To play in; the run's own where None.
 
     Raises:
         UserError: If one of them cannot be used.
@@ -48,6 +57,8 @@ def render(run: str, number: int, out: Path, steps: int, *, env_name: str = "dri
         need("av", "render", "ppl render to .mp4")
     named = run in ("scripted", "neural")
     name, options = (env_name, {}) if named else run_options(Path(run))
+    if physics is not None:
+        options["physics"] = physics
     env = make_env(name, options)
     save_frames(out, episode(env, named_expert(run, env), number, steps))
 

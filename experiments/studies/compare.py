@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     Command = Ablation | Compare | Tune
 
-OPTIONS = ("gate", "min_return", "max_departure", "min_log_density", "batch_size")
+_OF_EVERY_METHOD = ("batch_size", "physics")
+OPTIONS = ("gate", "min_return", "max_departure", "min_log_density", *_OF_EVERY_METHOD)
 COMMON = ("preset", "expert", "scenarios", "held_out_scenarios")
 
 
@@ -68,7 +69,7 @@ def settings_of(
     asked = {name: getattr(command, name, None) for name in OPTIONS}
     asked = {name: value for name, value in asked.items() if value is not None}
     if not algorithms.method(algorithm).gated:
-        asked = {name: value for name, value in asked.items() if name == "batch_size"}
+        asked = {name: value for name, value in asked.items() if name in _OF_EVERY_METHOD}
     gate = {"gate": asked["gate"]} if "gate" in asked else {}
     try:
         known = values(*algorithms.settings(algorithm, command.env, **gate))

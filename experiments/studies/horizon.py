@@ -31,7 +31,7 @@ def measure_horizon(command: Horizon) -> None:
     """
     from experiments.engine.settings import run_settings
 
-    asked = {"total_steps": command.total_steps, "batch_size": command.batch_size}
+    asked = {name: getattr(command, name) for name in ("total_steps", "batch_size", "physics")}
     given = {name: value for name, value in asked.items() if value is not None}
     settings = run_settings(command.env, expert=command.expert, given=given)
     config = settings.config

@@ -12,7 +12,7 @@ from typing import Any
 
 from experiments.engine.files import write_text_atomic
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import traced_values
+from experiments.engine.settings import ADDED, traced_values
 from experiments.report.tables import EPISODES, RESULTS
 from experiments.studies.grid import Run, plain, show
 from ppl_jax.config import values
@@ -173,7 +173,7 @@ def _key(settings: Mapping[str, Any]) -> str:
     """Equal for the same run; the bound on L, which only sets a buffer's width, does not matter."""
     kept = dict(settings)
     kept["settings"] = {
-        k: v for k, v in kept.get("settings", {}).items() if k != "max_preference_horizon"
+        k: v for k, v in (ADDED | kept.get("settings", {})).items() if k != "max_preference_horizon"
     }
     return json.dumps(kept, sort_keys=True)
 

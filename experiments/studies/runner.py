@@ -247,7 +247,7 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
 def _program(run: Run) -> tuple[str, str]:
     """The name of a run's program, for people and in the log of compile times."""
     settings = run.settings
-    name = f"{settings.algorithm} in {settings.env}"
+    name = f"{settings.algorithm} in {settings.where}"
     return name, f"sweep: {name}, {settings.config.total_steps} steps"
 
 

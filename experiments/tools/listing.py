@@ -19,12 +19,17 @@ def _first_line(function: Any) -> str:
     return (function.__doc__ or "").strip().partition("\n")[0]
 
 
+def _environment(name: str) -> str:
+    """An environment with what it is, and the physics that it can run on."""
+    facts = card(name)
+    choices = f" Physics: {', '.join(facts.physics)}." if facts.physics else ""
+    return f"{name:16} {facts.summary or facts.title}{choices}".rstrip()
+
+
 def listing() -> str:
     """Every name by kind, a line each."""
     sections = {
-        "environments": [
-            f"{name:16} {card(name).summary or card(name).title}".rstrip() for name in registered()
-        ]
+        "environments": [_environment(name) for name in registered()]
         + ["brax:NAME        any environment of brax"],
         "methods": [
             f"{name:20} {_first_line(algorithms.method(name).make)}".rstrip()

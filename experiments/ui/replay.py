@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from experiments.engine import recording
-from experiments.engine.evaluate import make_env
+from experiments.engine.evaluate import make_env, run_physics
 from experiments.engine.runtime import UserError
 from experiments.ui.config import participant_of
 from experiments.ui.play import web
@@ -175,7 +175,8 @@ def replay(path: Path, host: str, port: int, exposed: bool = False) -> None:
     except UserError as error:
         raise UserError(f"recording {str(path)!r} cannot be shown: {error}") from error
     names = ("scenarios", "held_out_scenarios")
-    env = make_env(name, {key: v for key in names if (v := config.get(key)) is not None})
+    options = {key: v for key in names if (v := config.get(key)) is not None}
+    env = make_env(name, {"physics": run_physics(config), **options})
     with server.listen(host, port, exposed) as served:
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)

@@ -19,7 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.engine.evaluate import evaluate_policy, read_evaluation, summarise_episodes
+from experiments.engine.evaluate import (
+    evaluate_policy,
+    physics_of,
+    read_evaluation,
+    summarise_episodes,
+)
 from experiments.engine.policy_file import save_policy
 from experiments.engine.recording import PredictedPath, Recorder
 from experiments.engine.run import algorithm_factory, restore_learner, saved_policy
@@ -329,6 +334,7 @@ class InteractiveTrainer:
             "training_cost": float(counters.cost),
             "physics_diverged_episodes": int(counters.physics_diverged),
             "diverged": bool(self.learner.diverged),
+            **physics_of(self.env),
             "wall_s": round(time.perf_counter() - self._began, 1),
             **more,
         }

@@ -184,6 +184,10 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(run, tmp_path)
         (["ablation", "driving", "--seeds", "0"], "seeds must be at least 1, got 0"),
         (["train", "driving", "--preference-horizon", "11"], "preference_horizon must not exceed"),
         (["train", "driving", "--preference-horizon", "0"], "preference_horizon must be at least"),
+        (["train", "driving", "--physics", "mjx"], "physics must be auto for 'driving', got 'mjx'"),
+        (["sweep", "driving", "--physics", "auto", "mjx"], "physics must be auto for 'driving'"),
+        (["compare", "lift", "--physics", "analytic"], "physics must be auto or one of mjx"),
+        (["render", "scripted", "--physics", "mjx"], "physics must be auto for 'driving'"),
         (["train", "driving", "--beta", "-1"], "beta must not be negative, got -1"),
         (["train", "driving", "--prediction-noise", "-0.5"], "prediction_noise must not be"),
         (["train", "driving", "--total-steps", "0"], "total_steps must be at least 1, got 0"),
@@ -293,3 +297,12 @@ for package in (envs, experiments, ppl_jax):
         assert not bridge.backends_are_initialized(), module.name
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.slow
+def test_a_run_on_mjx(tmp_path):
+    pytest.importorskip("mujoco.mjx")
+    words = ["--physics", "mjx", "--total-steps", "20", "--batch-size", "16", "--hidden", "16"]
+    ppl("train", "table_wiping", *words, "--out", tmp_path / "a")
+    assert json.loads((tmp_path / "a" / "config.json").read_text())["settings"]["physics"] == "mjx"
+    assert json.loads((tmp_path / "a" / "summary.json").read_text())["physics"] == "mjx"

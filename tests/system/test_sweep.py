@@ -24,7 +24,7 @@ from experiments.studies.runner import plan
 from ppl_jax import sweep as pure
 from ppl_jax.config import replace
 from ppl_jax.training import make_train
-from tests.helpers import ROOT, Probe, probe_settings, program
+from tests.helpers import ROOT, Probe, call, probe_settings, program
 
 if "probe" not in envs.registered():
     envs.register("probe", Probe)
@@ -361,6 +361,50 @@ def test_a_ray_cluster_that_loses_a_node_loses_and_doubles_nothing(tmp_path):
         cluster.shutdown()
     for name in FILES:
         assert (out / name).read_bytes() == (tmp_path / "local" / name).read_bytes()
+
+
+# --- physics ---
+
+ENGINES = """
+import envs
+from experiments import cli
+from ppl_jax.cards import EnvCard
+from tests.helpers import Probe
+
+class Engines(Probe):
+    name = "engines"
+
+    def __init__(self, physics):
+        super().__init__()
+        self.physics = "exact" if physics == "auto" else physics
+        self.tolerance = {"exact": 0.15, "loose": 9.0}[self.physics]  # the loose one forgives all
+
+envs.register("engines", Engines, EnvCard(physics=("exact", "loose")))
+if __name__ == "__main__":
+    cli.main()
+"""
+
+
+def test_a_run_and_a_sweep_use_the_physics_that_is_asked_for(tmp_path):
+    script, run, out = tmp_path / "engines.py", tmp_path / "run", tmp_path / "s"
+    script.write_text(ENGINES)
+    call(script, "train", "engines", *TINY, "--physics", "loose", "--out", run)
+    summary = json.loads((run / "summary.json").read_text())
+    assert (summary["physics"], summary["success_rate"]) == ("loose", 1.0)
+    assert json.loads((run / "config.json").read_text())["settings"]["physics"] == "loose"
+    call(script, "evaluate", run, "--physics", "exact", "--out", tmp_path / "rows.csv")
+    assert {row["success"] for row in rows_of(tmp_path / "rows.csv")} == {"0"}
+
+    words = ["sweep", "engines", "--physics", "auto", "loose", "--seeds", "1", *TINY, "--out", out]
+    assert "2 programs to compile" in call(script, *words).stderr
+    rows = rows_of(out / "results.csv")
+    assert {row["physics"] for row in rows} == {"auto", "loose"}
+    assert {row["success"] for row in rows if row["physics"] == "loose"} == {"1"}
+    # one from before physics could be chosen ran on "auto"
+    held = json.loads((out / "sweep.json").read_text())
+    del held["runs"]["engines/ppl/batch_size=8,physics=auto/seed=0"]["settings"]["physics"]
+    (out / "sweep.json").write_text(json.dumps(held))
+    assert "2 of them done" in call(script, *words).stderr
 
 
 # --- another axis, and the call for notebooks ---

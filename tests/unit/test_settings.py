@@ -9,10 +9,26 @@ import pytest
 
 import ppl_jax
 from experiments.cli import parse
+from experiments.engine.evaluate import run_options
+from experiments.engine.run import build_env, open_folder
+from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import RunSettings, flat, one_level, run_settings, with_values
+from experiments.engine.settings import (
+    ADDED,
+    RunSettings,
+    check,
+    flat,
+    one_level,
+    refuse_contradictions,
+    run_settings,
+    with_values,
+)
 from experiments.options.seeds import parse_seeds
 from experiments.options.settings import settings_in
+from experiments.studies import grid
+from experiments.studies.compare import settings_of
+from experiments.studies.results import Results
+from experiments.studies.runner import plan
 from ppl_jax import algorithms
 from ppl_jax.config import (
     PRESETS,
@@ -93,6 +109,7 @@ def old_config(name, env="driving", **changes):
     both = values(config, hparams)
     static = {k: v for k, v in both.items() if k in values(TrainConfig(), HParams())}
     static = {k: list(v) if isinstance(v, tuple) else v for k, v in static.items()}
+    static = {k: v for k, v in static.items() if k not in ADDED}
     traced = {k: both.get(k, 0.5) for k in ("beta", "discount", "learning_rate", "min_speed")}
     static |= {"members": 5, "rollout_steps": 2000, "objective": "cpo"}
     content = {"env": env, "algorithm": name, "seed": 3, "expert": "scripted"}
@@ -248,3 +265,74 @@ def test_an_option_of_train_reaches_the_run(words, setting, value):
     assert found[setting] == value
     untouched = parse(["train", "driving"]).settings
     assert values(untouched.config, untouched.hparams).get(setting) != value
+
+
+def test_physics_is_an_option_of_every_command_that_trains(tmp_path):
+    settings = parse(["train", "table_wiping", "--physics", "mjx"]).settings
+    check(settings)
+    assert settings.as_json()["settings"]["physics"] == "mjx"
+    assert RunSettings.from_json(settings.as_json()).config.physics == "mjx"
+    assert settings.where == "table_wiping on mjx"
+    analytic = parse(["train", "table_wiping", "--physics", "analytic"]).settings
+    assert build_env(analytic).physics == "analytic"
+    for words in (["compare"], ["ablation"], ["tune"]):
+        command = parse([*words, "nut_assembly", "--physics", "mujoco_c"])
+        for method in ("ppl", "bc", "thrifty_dagger"):
+            assert settings_of(command, method, 0, {}).config.physics == "mujoco_c"
+    assert parse(["expert", "train", "lift", "--physics", "mjx"]).settings.physics == "mjx"
+    assert parse(["play", "table_wiping", "--physics", "mjx"]).settings == {"physics": "mjx"}
+    for words in (["evaluate", "x"], ["render", "x"], ["horizon", "lift"]):
+        assert parse([*words, "--physics", "mjx"]).physics == "mjx"
+
+    runs = plan(parse(["sweep", "table_wiping", "--physics", "analytic", "mjx", "--seeds", "2"]))
+    assert [run.settings.config.physics for run in runs] == ["analytic"] * 2 + ["mjx"] * 2
+    assert len(grid.groups(runs)) == 2  # each is a program of its own
+    assert {"physics"} <= set(Results(tmp_path, runs).columns)
+
+
+@pytest.mark.parametrize(
+    ("env", "physics", "said"),
+    [
+        ("driving", "mjx", "physics must be auto for 'driving', got 'mjx'"),
+        ("lift", "analytic", "physics must be auto or one of mjx for 'lift', got 'analytic'"),
+        ("table_wiping", "bullet", "physics must be auto or one of analytic, mjx, mujoco_c for"),
+    ],
+)
+def test_a_physics_that_an_environment_lacks_is_refused(env, physics, said):
+    words = [env, "--physics", physics]
+    with pytest.raises(UserError, match=said):
+        check(parse(["train", *words]).settings)
+    with pytest.raises(UserError, match=said):
+        plan(parse(["sweep", *words]))
+    with pytest.raises(UserError, match=said):
+        settings_of(parse(["compare", *words]), "ppl", 0, {})
+    with pytest.raises(UserError, match=said):
+        parse(["expert", "train", *words])
+
+
+def before_later_settings(content, schema):
+    """A config.json without the settings that were added since."""
+    content = dict(content)
+    kept = {k: v for k, v in content.pop("settings").items() if k not in ADDED}
+    if schema == 1:
+        del content["schema"]
+        return content | {"config": kept, "hparams": {}}
+    return content | {"settings": kept}
+
+
+@pytest.mark.parametrize("schema", [1, 2])
+def test_a_config_from_before_physics_could_be_chosen_is_read_and_continued(schema, tmp_path):
+    content = before_later_settings(run_settings("table_wiping").as_json(), schema)
+    settings = RunSettings.from_json(content)
+    assert settings.config.physics == "auto"
+    folder = RunFolder(tmp_path / "run")
+    folder.create(content)
+    open_folder(folder, settings.as_json(), resume=True)
+    assert run_options(folder.path) == ("table_wiping", {"physics": "auto"})
+    resumed = ["train", "--resume", "--out", str(folder.path)]
+    assert parse(resumed).settings == settings
+    with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
+        parse([*resumed, "--physics", "mjx"])
+    held, asked = one_level(content), one_level(settings.as_json())
+    with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
+        refuse_contradictions(folder.path, held, asked | {"physics": "mjx"})
