@@ -82,7 +82,7 @@ LIFT = EnvCard(
     actions=(*_HAND, "gripper"),
     physics=("mjx",),
     view="arm",
-    camera={"lookat": (-0.05, -0.02, 0.92), "distance": 1.1, "azimuth": 150, "elevation": -25},
+    camera={"lookat": (-0.06, -0.02, 0.92), "distance": 0.9, "azimuth": 150, "elevation": -25},
     demonstrations=10_000,
     warm_up=300,
     settings={
@@ -93,5 +93,5 @@ LIFT = EnvCard(
     },
     missing_presets=("reference",),
     step_ms=30.0,
-    compile_s=120.0,
+    compile_s=200.0,
 )
