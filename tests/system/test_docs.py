@@ -68,7 +68,7 @@ def read(site, page):
 
 
 def test_pages_show_docstrings_examples_and_tables_of_the_readme(site):
-    extending = read(site, "extending")
+    extending = read(site, "extending") + read(site, "bring_your_own_scene")
     assert "ppl_jax.algorithms.base.Algorithm" in extending
     assert "update_every" in extending  # from the docstring
     for example in (ROOT / "experiments" / "examples").rglob("*.py"):

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -38,31 +39,41 @@ def test_own_world_trains_from_outside(tmp_path):
     assert len(rows) == 1 + 10
 
 
-def test_own_scene_is_solved_by_its_expert_from_outside(tmp_path):
-    shutil.copytree(EXAMPLES / "own_scene", tmp_path / "own_scene")
-    told = run(
-        tmp_path, "-m", "own_scene.expert", "expert", "evaluate", "hover", "--kind", "scripted"
-    )
+PAGE = (ROOT / "docs" / "pages" / "bring_your_own_scene.md").read_text()
+
+
+def follow(folder):
+    """What the page says to write: each named file with the text that the page includes."""
+    (folder / "own_mjx_scene").mkdir()
+    (folder / "own_mjx_scene" / "__init__.py").touch()
+    files = re.findall(r"^`(own_mjx_scene/\w+\.py)`.*?--8<--\n(\S+)\n--8<--", PAGE, re.M | re.S)
+    assert len(files) == 3
+    for name, source in files:
+        assert source == f"experiments/examples/{name}"
+        shutil.copy(ROOT / source, folder / name)
+    (code,) = [text for text in re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
+               if "--8<--" not in text]  # fmt: skip
+    return code, re.findall(r"^python (-m own_mjx_scene.*)$", PAGE, re.M)
+
+
+def test_the_page_about_a_scene_of_ones_own_works_line_by_line(tmp_path):
+    pytest.importorskip("mujoco")
+    code, commands = follow(tmp_path)
+    assert run(tmp_path, "-c", code).split() == ["12", "6"]
+    evaluate = commands[0].split()
+    assert evaluate[2:] == ["expert", "evaluate", "push", "--kind", "scripted"]
+    told = run(tmp_path, *evaluate)
     assert "success" in told
     assert "1.00" in told
 
 
-def test_own_scene_is_drawn(tmp_path):
+@pytest.mark.slow  # compiles for minutes
+def test_the_scene_of_the_page_trains_and_is_drawn(tmp_path):
     pytest.importorskip("mujoco")
-    shutil.copytree(EXAMPLES / "own_scene", tmp_path / "own_scene")
-    code = (
-        "import own_scene.expert, envs, jax, numpy as np\n"
-        "from envs.manipulation.twins import make_twin\n"
-        "env = envs.make('hover')\n"
-        "state = env.reset_to(0, jax.random.key(0), env.default_params)\n"
-        "twin = make_twin(env)\n"
-        "twin.place(state)\n"
-        "twin.arm.mujoco.mj_kinematics(twin.arm.model, twin.arm.data)\n"
-        "site = twin.arm.data.site_xpos[twin.arm.site]\n"
-        "assert np.abs(site - np.asarray(env.grip_position(state))).max() < 1e-4\n"
-        "np.testing.assert_allclose(twin.arm.data.mocap_pos[0], state.goal, atol=1e-6)\n"
-    )
-    run(tmp_path, "-c", code)
+    _, (_, train, render) = follow(tmp_path)
+    run(tmp_path, *train.split(), *SHORT)
+    run(tmp_path, *render.split(), "--steps", "4")
+    assert (tmp_path / "push.gif").stat().st_size > 0
 
 
 PROBE = """

@@ -13,7 +13,6 @@ from envs.manipulation.physics.analytic.arm import (
     Motion,
     Vector,
     add,
-    bias_torque,
     combine,
     cross,
     dot,
@@ -29,8 +28,6 @@ from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
     DAMPING,
     FRICTION_LOSS,
-    SUBSTEPS,
-    TIMESTEP,
     TORQUE_LIMIT,
     Tool,
 )
@@ -304,33 +301,3 @@ def joint_brake(speed: Scalar, damping: float, friction: float) -> Scalar:
     Dry friction builds up within 1e-3 rad/s (tanh): MuJoCo's own costs a solver row per joint.
     """
     return damping * speed + friction * jnp.tanh(speed / _SETTLING)
-
-
-def free_steps(
-    joints: jax.Array, speeds: jax.Array, action: jax.Array, *, held: jax.Array, tool: Tool
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One control step of 0.05 s of an arm that nothing touches: 25 steps of 2 ms.
-
-    Args:
-        joints, speeds: [6] rad, rad/s.
-        action: [6] in [-1, 1]: shift and turn of the grip site.
-        held: [3, 3] rows are the axes of the last orientation goal.
-        tool: In the hand.
-
-    Returns:
-        Joints, speeds and the new orientation goal.
-    """
-    at = unrolled_linalg.materialize(frames(list(joints), tool))
-    action = jnp.clip(action, -1.0, 1.0)
-    last = (tuple(held[0]), tuple(held[1]), tuple(held[2]))
-    goal = unrolled_linalg.materialize(new_goal(list(action), at.position, at.rotation, last))
-    weight = unrolled_linalg.materialize(bias_torque(at, tool, list(speeds)))
-
-    def step(carry: tuple[jax.Array, jax.Array], _: None) -> Any:
-        joints, speeds = carry
-        motion = free_motion(list(joints), list(speeds), goal=goal, tool=tool, weight=weight)
-        speeds = speeds + TIMESTEP * jnp.stack(motion.acceleration)
-        return (joints + TIMESTEP * speeds, speeds), None
-
-    joints, speeds = jax.lax.scan(step, (joints, speeds), None, length=SUBSTEPS)[0]
-    return joints, speeds, unrolled_linalg.array(goal[1])

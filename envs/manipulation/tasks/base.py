@@ -136,11 +136,6 @@ class ArmTask(Environment):
         return jnp.stack(twist_of(jacobian(at), list(state.speeds))[0])
 
 
-def site_rotation(joints: jax.Array, tool: Tool) -> jax.Array:
-    """Axes of the grip site as rows, [3, 3]: the orientation goal at the start of an episode."""
-    return unrolled_linalg.array(frames(list(joints), tool).rotation)
-
-
 def lagged_frames(state: Any, tool: Tool) -> Frames:
     """Kinematics one physics step ago: what robosuite observes and rewards.
 

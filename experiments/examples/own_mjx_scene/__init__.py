@@ -1,0 +1,1 @@
+"""A scene of your own on MJX: its MJCF, its task and its expert."""

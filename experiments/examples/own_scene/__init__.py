@@ -1,1 +1,0 @@
-"""A manipulation scene of your own in three files: scene, task and expert."""
