@@ -11,6 +11,7 @@ pytest.importorskip("mujoco")
 
 from envs.manipulation.control.on_mjx import OperationalSpace
 from envs.manipulation.physics.mjx.scene import Scene
+from envs.manipulation.physics.mujoco_c import import_mujoco
 from envs.manipulation.scenes.panda import FLANGE, JOINTS, LIMITS, REST, TORQUE_LIMIT, panda_arm
 
 GRIP = 0.1
@@ -67,15 +68,14 @@ def _step():
 def settled(joints, place=(np.nan,) * 3, steps=40):
     """The arm's state, site and last torques after `steps` control steps without an action."""
     bodies = scene().start(joints)
-    held, torque = _place()(bodies)[1], None
+    held, torque = _place()(bodies)[1], jnp.zeros(7)
     for _ in range(steps):
         bodies, held, torque = _step()(bodies, held, jnp.asarray(place), jnp.zeros(6))
     return bodies, _place()(bodies), torque
 
 
 def test_kinematics_are_the_published_ones():
-    import mujoco
-
+    mujoco = import_mujoco()
     joints = np.random.default_rng(0).uniform(LIMITS[:, 0], LIMITS[:, 1])
     data = mujoco.MjData(scene().full)
     data.qpos[:] = joints
