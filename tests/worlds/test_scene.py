@@ -7,8 +7,11 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from envs.check import check_env
 from envs.manipulation.control.on_mjx import OperationalSpace
 from envs.manipulation.physics.mjx.scene import Scene
+from envs.manipulation.scenes import panda
+from envs.manipulation.tasks.scene_task import SceneTask, Start, Verdict
 
 BALL = '<body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/></body>'
 
@@ -107,3 +110,65 @@ def test_features_of_published_models():
         bodies = step(bodies)
     np.testing.assert_allclose(bodies.qpos[at], 0.03, atol=2e-3)
     assert bool(jnp.all(jnp.isfinite(bodies.qvel)))
+
+
+FINGERS = """
+<inertial mass=".3" pos="0 0 .03" diaginertia="1e-3 1e-3 1e-3"/>
+<body name="left" pos="0 .02 .1"><joint name="left" type="slide" axis="0 1 0"/>
+  <geom name="left" size=".01" mass=".02"/></body>
+<body name="right" pos="0 -.02 .1"><joint name="right" type="slide" axis="0 -1 0"/>
+  <geom name="right" size=".01" mass=".02"/></body>"""
+
+
+class Grasp(SceneTask):
+    """A task with two servos in the hand."""
+
+    name = "grasp"
+    max_episode_steps = 10
+
+    def __init__(self, limits=('ctrlrange="0 .04"', 'ctrlrange="0 .02"'), **options):
+        motors = "".join(
+            f'<position name="{side}" joint="{side}" kp="100" {limit}/>'
+            for side, limit in zip(("left", "right"), limits, strict=True)
+        )
+        scene = Scene(
+            '<mujoco><compiler angle="radian"/><option timestep=".002"/><worldbody>'
+            f"{panda.panda_arm(FINGERS, grip=0.1)}</worldbody>"
+            f"<actuator>{motors}</actuator></mujoco>"
+        )
+        arm = OperationalSpace(
+            scene, joints=panda.JOINTS, site="grip", torque_limit=panda.TORQUE_LIMIT
+        )
+        super().__init__(scene, arm, training=range(3), held_out=range(2), **options)
+
+    def draw(self, key):
+        return Start(jnp.zeros(self.scene.model.nq).at[self.arm.qpos].set(panda.REST))
+
+    def judge(self, before, after):
+        high = after.site.position[2] > 0.5
+        return Verdict(reward=high.astype(jnp.float32), success=high)
+
+    def see(self, state):
+        return state.bodies.qpos
+
+
+def test_servos_in_the_hand_are_driven_by_the_end_of_the_action():
+    env = Grasp()
+    check_env(env, "grasp")
+    assert env.spec.action_size == 8
+    np.testing.assert_allclose(env.control_of(jnp.array([1.0, -1.0])), [0.04, 0.0], atol=1e-7)
+    start = jax.eval_shape(
+        lambda: env.reset_to(jnp.int32(0), jax.random.key(0), env.default_params)
+    )
+    assert start.bodies.ctrl.shape == (2,)
+    one = Grasp(hand_actions=1)
+    check_env(one, "grasp")
+    assert one.spec.action_size == 7
+    np.testing.assert_allclose(one.control_of(jnp.zeros(1)), [0.02, 0.01], atol=1e-7)
+
+
+def test_servos_that_do_not_fit():
+    told = message(lambda: Grasp(limits=('ctrlrange="0 .04"', "")))
+    assert told == "actuator 'right' needs a ctrlrange: an action of 1 is its end"
+    told = message(lambda: Grasp(hand_actions=3))
+    assert told == "hand_actions must be 1 or 2 (actuators), got 3"

@@ -285,6 +285,14 @@ class SceneTask(ArmTask):
 
     # ---- physics
 
+    def control_of(self, hand: jax.Array) -> jax.Array:
+        """Control of each actuator, [nu], for the action's components after the sixth.
+
+        An action of -1 and 1 are the ends of `ctrlrange`; a single one drives all alike.
+        """
+        share = (1 + jnp.broadcast_to(hand, self._low.shape)) / 2
+        return self._low + (self._high - self._low) * share
+
     def _site(self, data: Any) -> Site:
         arm = self.arm
         speeds = data.qvel[arm.dofs]
@@ -298,10 +306,8 @@ class SceneTask(ArmTask):
         """The state after the physics steps of one control step; its time is the old one."""
         scene, arm, gripper = self.scene, self.arm, self.gripper
         put, bodies = scene.varied(factors, self._handled), state.bodies
-        if gripper is None and bodies.ctrl is not None and action.shape[0] > MOTION:
-            share = (1 + jnp.broadcast_to(action[MOTION:], self._low.shape)) / 2
-            ctrl = self._low + (self._high - self._low) * share
-            bodies = dataclasses.replace(bodies, ctrl=ctrl)
+        if gripper is None and scene.model.nu:
+            bodies = dataclasses.replace(bodies, ctrl=self.control_of(action[MOTION:]))
 
         def aimed(data: Any, goal: Goal, first: jax.Array) -> Goal:
             """The goal of the control step, from the frames of its first physics step."""
