@@ -152,7 +152,10 @@ class SceneTask(ArmTask):
         Raises:
             ValueError: If an actuator has no `ctrlrange`, or `hand_actions` fits no actuators.
         """
-        pools = [SceneParams(jnp.asarray(n, jnp.int32), 1.0) for n in (training, held_out)]
+        pools = [
+            SceneParams(number=jnp.asarray(numbers, jnp.int32), reward_scale=jnp.float32(1.0))
+            for numbers in (training, held_out)
+        ]
         super().__init__(*pools, experts=experts or {})
         self.sequential_on_cpu = False
         self.scene, self.arm = scene, arm
