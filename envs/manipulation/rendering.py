@@ -7,6 +7,7 @@ all the rest.
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -54,8 +55,8 @@ def _renderer(mujoco: Any, model: Any, height: int, width: int) -> Any:
 def choose_backend() -> None:
     """Set `MUJOCO_GL` where it is unset: EGL if it works here, else OSMesa.
 
-    Tried in a process of its own, since a backend cannot be changed once loaded. Call before MuJoCo
-    is imported.
+    Tried in a process of its own, since a backend cannot be changed once loaded. MuJoCo picks one
+    when it is imported, which a scene on MJX does before anything is drawn: it picks again.
     """
     if "MUJOCO_GL" in os.environ:
         return
@@ -64,6 +65,9 @@ def choose_backend() -> None:
         [sys.executable, "-c", probe], env=os.environ | {"MUJOCO_GL": "egl"}, capture_output=True
     )
     os.environ["MUJOCO_GL"] = "egl" if done.returncode == 0 else "osmesa"
+    picks = sys.modules.get("mujoco.rendering.classic.gl_context")
+    if picks is not None:
+        importlib.reload(picks)
 
 
 def _drawn(env: Any) -> Any:
