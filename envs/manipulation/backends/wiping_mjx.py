@@ -20,7 +20,7 @@ from envs.manipulation.scenes.model import (
 )
 from envs.manipulation.tasks.wiping import Moved, WipingState
 
-ITERATIONS = 8  # of the contact solver, at most
+ITERATIONS = 20  # of the contact solver, at most
 
 
 def without_air(text: str) -> Any:

@@ -89,17 +89,22 @@ def cones(scene: Any, put: Any, data: Any) -> Cones | None:
     sign = scene.moved_by[second] - scene.moved_by[first]  # [C, nv]
     # a degree of freedom moves a point p at v + w x p, w and v seen at the world's origin
     spin = data.cdof[:, :3]
-    at = data.subtree_com[scene.dof_root]
-    velocity = data.cdof[:, 3:] - jnp.cross(spin, at)
-    axes = jnp.moveaxis(contact.frame.reshape(-1, 3, 3), 1, 0)[np.array([1, 2, 0])]  # [3, C, 3]
-    turning = jnp.cross(contact.pos[None], axes)
-    twist = jnp.concatenate([velocity, spin], -1)  # [nv, 6]
-    jacobian = jnp.concatenate([axes, turning], -1) @ twist.T * sign
+    velocity = data.cdof[:, 3:] - jnp.cross(spin, data.subtree_com[scene.dof_root])
+    twist = jax.lax.optimization_barrier(jnp.concatenate([velocity, spin], -1))  # [nv, 6]
+    axes = jnp.transpose(contact.frame.reshape(-1, 3, 3), (2, 1, 0))[:, np.array([1, 2, 0])]
+    (x, y, z), (ex, ey, ez) = contact.pos.T, axes  # [C] each, [3, C] each
+    around = jnp.stack([y * ez - z * ey, z * ex - x * ez, x * ey - y * ex])
+    wrench = jax.lax.optimization_barrier(jnp.concatenate([axes, around]))  # [6, 3, C]
+    # one product of small matrices would be one number at a time on a CPU
+    jacobian = wrench[0] * twist[:, 0, None, None]
+    for part in range(1, 6):
+        jacobian = jacobian + wrench[part] * twist[:, part, None, None]
+    jacobian = jax.lax.optimization_barrier(jacobian * sign.T[:, None])  # [nv, 3, C]
     position = contact.dist - contact.includemargin
     k, b, d = _stiffness(put, contact.solref, contact.solimp, position, scene.plain_powers)
     inverse = put.body_invweight0[first, 0] + put.body_invweight0[second, 0]
     weight = d / jnp.maximum(inverse * (1 - d), _TINY)
-    speed = jacobian @ data.qvel
+    speed = jnp.sum(jacobian * data.qvel[:, None, None], 0)
     reference = (-b * speed).at[2].add(-k * d * position)
     return Cones(
         jacobian=jacobian,

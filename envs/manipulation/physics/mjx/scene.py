@@ -352,7 +352,7 @@ class Scene:
             pulls = pulls + rows.jacobian.T @ solved.rows
         if cones is not None:
             forces.append(jnp.roll(solved.cones, 1, 0).T.reshape(-1))  # normal first, as MJX's
-            pulls = pulls + jnp.einsum("acn,ac->n", cones.jacobian, solved.cones)
+            pulls = pulls + jnp.sum(cones.jacobian * solved.cones, (1, 2))
         return data.replace(qacc=solved.acceleration, qfrc_constraint=pulls).tree_replace(
             {"_impl.efc_force": jnp.concatenate(forces)}
         )
