@@ -1,7 +1,8 @@
 """How close these environments are to robosuite 1.4.1: `python -m envs.manipulation.fidelity DIR`.
 
-Prints one JSON object for a folder of recordings (`wipe_*`, `nut_*`, `free_wipe_*`, `free_nut_*`,
-`osc_steps`, `press`, `lookahead`, each `.npz`); a figure whose files are missing is null:
+`--physics` chooses the engine (analytic, mjx, mujoco_c). Prints one JSON object for a folder of
+recordings (`wipe_*`, `nut_*`, `free_wipe_*`, `free_nut_*`, `osc_steps`, `press`, `lookahead`, each
+`.npz`); a figure whose files are missing is null:
 
 - `free_motion_error_1s_max`: m, largest distance of the grip site from the recorded one in 20
   replayed steps, from every twentieth recorded state of the free motions;
@@ -20,10 +21,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +35,33 @@ from envs.compiler import set_xla_flags
 from envs.manipulation.make import make_nut_assembly, make_table_wiping
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import frames
+from envs.manipulation.physics.analytic.quaternion import rotation_matrix
 from envs.manipulation.scenes.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, WIPING_BASE
 from envs.manipulation.tasks import nut, wiping
 
 FREE_STEPS, WINDOW = 20, 10
 _LONGEST = 250  # steps that a compiled replay holds; longer recordings are replayed in parts
-_WIPING = make_table_wiping(range(1), range(1))
-_NUT = make_nut_assembly(range(1), range(1))
 _KEY = jax.random.key(0)
+
+
+class Worlds(NamedTuple):
+    """The two environments on one physics."""
+
+    wiping: wiping.TableWiping
+    nut: nut.NutAssembly
+
+
+@functools.cache
+def worlds(physics: str) -> Worlds:
+    """Both environments with one start each.
+
+    Raises:
+        ValueError: If the physics is unknown.
+    """
+    return Worlds(
+        make_table_wiping(range(1), range(1), physics=physics),
+        make_nut_assembly(range(1), range(1), physics=physics),
+    )
 
 
 def wiping_state(record: Any, row: int | tuple[int, ...]) -> wiping.WipingState:
@@ -58,7 +79,8 @@ def wiping_state(record: Any, row: int | tuple[int, ...]) -> wiping.WipingState:
 
 
 def _wiping_state(values: dict[str, np.ndarray]) -> wiping.WipingState:
-    start = _WIPING.reset_to(jnp.int32(0), _KEY, _WIPING.default_params)
+    env = worlds("analytic").wiping
+    start = env.reset_to(jnp.int32(0), _KEY, env.default_params)
     return dataclasses.replace(
         start,
         joints=jnp.float32(values["qpos"]),
@@ -78,10 +100,11 @@ def _wiping_state(values: dict[str, np.ndarray]) -> wiping.WipingState:
 def nut_state(record: Any, row: Any, prefix: str = "") -> nut.NutState:
     """The recorded state `row` of an episode (or of `lookahead.npz`, with its prefix)."""
     values = {name: record[prefix + name][row] for name in ("qpos", "qvel", "goal_ori", "timestep")}
-    start = _NUT.reset_to(jnp.int32(0), _KEY, _NUT.default_params)
+    env = worlds("analytic").nut
+    start = env.reset_to(jnp.int32(0), _KEY, env.default_params)
     qpos, qvel = values["qpos"], values["qvel"]
     quaternion = jnp.float32(qpos[22:26])
-    turn = np.asarray(nut.rotation_matrix(quaternion))
+    turn = np.asarray(rotation_matrix(quaternion))
     touching = record[prefix + "pads_touch"][row] if prefix + "pads_touch" in record else False
     return dataclasses.replace(
         start,
@@ -139,13 +162,13 @@ def _load(folder: Path, pattern: str) -> list[dict[str, np.ndarray]]:
     return found
 
 
-def _free(folder: Path) -> float | None:
+def _free(folder: Path, on: Worlds) -> float | None:
     worst = []
-    for env, name, at in ((_WIPING, "free_wipe_*.npz", 26), (_NUT, "free_nut_*.npz", 32)):
+    for env, name, at in ((on.wiping, "free_wipe_*.npz", 26), (on.nut, "free_nut_*.npz", 32)):
         states, actions, wanted = [], [], []
         for record in _load(folder, name):
             for row in range(0, len(record["action"]) - FREE_STEPS + 1, FREE_STEPS):
-                make = wiping_state if env is _WIPING else nut_state
+                make = wiping_state if isinstance(env, wiping.TableWiping) else nut_state
                 states.append(make(record, row))
                 actions.append(record["action"][row : row + FREE_STEPS])
                 wanted.append(record["eef_pos"][row + 1 : row + 1 + FREE_STEPS])
@@ -157,7 +180,9 @@ def _free(folder: Path) -> float | None:
 
 def _grip_site(env: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
     """Positions and rotations (columns) of the grip site for states' lagged joints, [K]."""
-    tool, base = (WIPER, WIPING_BASE) if env is _WIPING else (GRIPPER, NUT_BASE)
+    tool, base = (
+        (WIPER, WIPING_BASE) if isinstance(env, wiping.TableWiping) else (GRIPPER, NUT_BASE)
+    )
 
     def one(joints: jax.Array, speeds: jax.Array) -> tuple[jax.Array, jax.Array]:
         at = frames(list(joints - TIMESTEP * speeds), tool)
@@ -167,12 +192,12 @@ def _grip_site(env: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(places), np.asarray(turns)
 
 
-def _steps(folder: Path) -> float | None:
+def _steps(folder: Path, on: Worlds) -> float | None:
     found = _load(folder, "osc_steps.npz")
     if not found:
         return None
     record, errors = found[0], []
-    for env, prefix in ((_WIPING, "wipe_"), (_NUT, "nut_")):
+    for env, prefix in ((on.wiping, "wipe_"), (on.nut, "nut_")):
         states = []
         for run in range(len(record[prefix + "qpos"])):
             qpos, qvel = record[prefix + "qpos"][run, 0], record[prefix + "qvel"][run, 0]
@@ -214,25 +239,25 @@ def _push_up(state: wiping.WipingState) -> jax.Array:
     return (-turn.T @ state.force)[2] + 9.81 * WIPER.mass
 
 
-def _press(folder: Path) -> float | None:
+def _press(folder: Path, on: Worlds) -> float | None:
     found = _load(folder, "press.npz")
     if not found:
         return None
     record, errors = found[0], []
     for run in range(len(record["action"])):
         state = wiping_state(record, (run, 0))
-        after = _replay_one(_WIPING, state, jnp.float32(record["action"][run]))[0]
+        after = _replay_one(on.wiping, state, jnp.float32(record["action"][run]))[0]
         push = np.asarray(_push_up(after))[-10:].mean()
         wanted = record["contact_force"][run, -10:, 2].mean()
         errors.append(abs(push - wanted) / wanted)
     return float(max(errors))
 
 
-def _observations(folder: Path) -> float | None:
+def _observations(folder: Path, on: Worlds) -> float | None:
     errors = []
-    for env, name in ((_WIPING, "wipe_*.npz"), (_NUT, "nut_*.npz")):
+    for env, name in ((on.wiping, "wipe_*.npz"), (on.nut, "nut_*.npz")):
         observe = jax.jit(lambda state, env=env: env.observe(state, env.default_params))
-        make = wiping_state if env is _WIPING else nut_state
+        make = wiping_state if isinstance(env, wiping.TableWiping) else nut_state
         for record in _load(folder, name):
             for row in range(0, len(record["obs"]), 3):
                 seen = np.asarray(observe(make(record, row)))
@@ -240,18 +265,18 @@ def _observations(folder: Path) -> float | None:
     return max(errors) if errors else None
 
 
-def _wipe_rewards(folder: Path) -> float | None:
+def _wipe_rewards(folder: Path, on: Worlds) -> float | None:
     agree = []
     for record in _load(folder, "wipe_*.npz"):
         steps = len(record["action"])
         actions = np.zeros((max(_LONGEST, steps), 6), np.float32)
         actions[:steps] = record["action"]
-        rewards = np.asarray(_replay_one(_WIPING, wiping_state(record, 0), actions)[1])[:steps]
+        rewards = np.asarray(_replay_one(on.wiping, wiping_state(record, 0), actions)[1])[:steps]
         agree.append(np.abs(rewards - record["reward"]) < 0.02)
     return float(np.concatenate(agree).mean()) if agree else None
 
 
-def _nut_windows(folder: Path) -> tuple[float | None, float | None]:
+def _nut_windows(folder: Path, on: Worlds) -> tuple[float | None, float | None]:
     states, actions, rewards, rings = [], [], [], []
     for record in _load(folder, "nut_*.npz"):
         for row in range(0, len(record["action"]) - WINDOW + 1, WINDOW):
@@ -261,21 +286,21 @@ def _nut_windows(folder: Path) -> tuple[float | None, float | None]:
             rings.append(record["nut_pos"][row + 1 : row + 1 + WINDOW])
     if not states:
         return None, None
-    _, reward, observation = _windows(_NUT, states, actions)
+    _, reward, observation = _windows(on.nut, states, actions)
     agree = np.abs(reward - np.array(rewards)) < 0.05
     off = np.linalg.norm(observation[:, :, :3] - np.array(rings), axis=-1)
     return float(agree.mean()), float(np.median(off))
 
 
-def _lookaheads(folder: Path) -> float | None:
+def _lookaheads(folder: Path, on: Worlds) -> float | None:
     found = _load(folder, "lookahead.npz")
     if not found:
         return None
     record, errors = found[0], []
-    for env, prefix in ((_WIPING, "wipe_"), (_NUT, "nut_")):
+    for env, prefix in ((on.wiping, "wipe_"), (on.nut, "nut_")):
         states = []
         for run, row in enumerate(record[prefix + "state"]):
-            if env is _NUT:
+            if isinstance(env, nut.NutAssembly):
                 states.append(nut_state(record, int(row), "nut_state_"))
                 continue
             names = ("qpos", "qvel", "goal_ori", "force_bias", "wiped", "qacc_warmstart", "obs",
@@ -291,25 +316,30 @@ def _lookaheads(folder: Path) -> float | None:
     return float(np.median(np.concatenate(errors)))
 
 
-def fidelity(folder: str | Path) -> dict[str, float | None]:
+def fidelity(folder: str | Path, physics: str = "auto") -> dict[str, float | None]:
     """The figures above for a folder of recordings.
 
+    Args:
+        folder: Folder.
+        physics: See `envs.manipulation.make.make_backend`.
+
     Raises:
-        ValueError: If there is no such folder, or no recording in it.
+        ValueError: If there is no such folder, or no recording in it, or the physics is unknown.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"no folder of recordings at {str(folder)!r}")
-    nut_agreement, nut_position = _nut_windows(folder)
+    on = worlds(physics)
+    nut_agreement, nut_position = _nut_windows(folder, on)
     figures = {
-        "free_motion_error_1s_max": _free(folder),
-        "step_response_error": _steps(folder),
-        "press_force_error": _press(folder),
-        "obs_max_abs_error": _observations(folder),
-        "wipe_reward_agreement": _wipe_rewards(folder),
+        "free_motion_error_1s_max": _free(folder, on),
+        "step_response_error": _steps(folder, on),
+        "press_force_error": _press(folder, on),
+        "obs_max_abs_error": _observations(folder, on),
+        "wipe_reward_agreement": _wipe_rewards(folder, on),
         "nut_reward_agreement": nut_agreement,
         "nut_position_error_median": nut_position,
-        "lookahead_return_error": _lookaheads(folder),
+        "lookahead_return_error": _lookaheads(folder, on),
     }
     if all(value is None for value in figures.values()):
         raise ValueError(f"no recording (wipe_*.npz, nut_*.npz, ...) in {str(folder)!r}")
@@ -320,9 +350,11 @@ def main() -> None:
     """Print the figures as JSON."""
     parser = argparse.ArgumentParser(prog="python -m envs.manipulation.fidelity")
     parser.add_argument("folder", help="folder of recordings")
+    parser.add_argument("--physics", default="auto", help="auto, analytic, mjx or mujoco_c")
+    given = parser.parse_args()
     set_xla_flags()
     try:
-        print(json.dumps(fidelity(parser.parse_args().folder), indent=2))
+        print(json.dumps(fidelity(given.folder, given.physics), indent=2))
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

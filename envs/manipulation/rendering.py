@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.manipulation.drawn import DrawnTask
+from envs.manipulation.drawn import drawn
 from envs.manipulation.physics.mujoco_c import import_mujoco
 
 DANGER, SAFE, EXPERT = (0.89, 0.14, 0.14, 1.0), (0.13, 0.63, 0.27, 1.0), (0.2, 0.47, 0.96, 1.0)
@@ -70,15 +70,6 @@ def choose_backend() -> None:
         importlib.reload(picks)
 
 
-def _drawn(env: Any) -> Any:
-    """What puts the states of an environment into MuJoCo's data."""
-    if hasattr(env, "scene"):
-        return DrawnTask(env)
-    from envs.manipulation.twins import make_twin
-
-    return make_twin(env)
-
-
 class ArmScene:
     """An environment ready to be drawn again and again."""
 
@@ -92,7 +83,7 @@ class ArmScene:
         """
         choose_backend()
         self.mujoco = mujoco = import_mujoco()
-        self.twin = _drawn(env)
+        self.twin = drawn(env)
         self.model, self.data = self.twin.arm.model, self.twin.arm.data
         if not smooth:
             self.model.vis.quality.offsamples = 0
