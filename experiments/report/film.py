@@ -98,7 +98,7 @@ def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
             expert_action=action,
             takeover=jnp.zeros((), bool),
             trajectory=novice,
-            experts=None,
+            experts=expert,
             log_density=jnp.asarray(jnp.nan),
         )
         takeover = rule.decide(point, hparams.gate, env.spec.observation_scale)
