@@ -54,6 +54,14 @@ def settings_page() -> str:
     parts += _owners("Gates", {n: _own(gate=gate(n).hparams()) for n in registered_gates()})
     predictors = {n: _own(predictor=predictor(n).hparams()) for n in registered_predictors()}
     parts += _owners("Predictors", predictors)
+    parts += [
+        "## Randomised worlds\n",
+        "Settings of runs with `randomise`, in the environments that have such ranges.\n",
+    ]
+    ranges = {n: card(n).ranges for n in registered()}
+    for make in dict.fromkeys(make for make in ranges.values() if make is not None):
+        parts += [", ".join(f"`{n}`" for n in registered() if ranges[n] is make) + ":\n"]
+        parts += [_table(_own(world=make()))]
     parts += ["## What changes the defaults\n", _changes()]
     parts += [
         "## Neural experts\n",

@@ -66,6 +66,10 @@ def _check_attributes(env: Env) -> None:
     flag = getattr(env, "sequential_on_cpu", None)
     _require(isinstance(flag, bool), f"sequential_on_cpu must be True or False, got {flag!r}")
     _require(isinstance(getattr(env, "card", None), EnvCard), "card must be an envs.cards.EnvCard")
+    _require(
+        env.card.ranges is None or callable(getattr(env, "with_ranges", None)),
+        "it has no method with_ranges(params, ranges), but its card has ranges",
+    )
     for field in ("experts", "predictors"):
         found = getattr(env, field, None)
         named = isinstance(found, Mapping) and all(callable(value) for value in found.values())

@@ -125,6 +125,8 @@ def _with_axes(cls: type, argv: Sequence[str]) -> tuple[type, Any]:
     words = list(argv)
     if "--algorithms" not in argv and study is not None:
         words += ["--algorithms", *STUDIES[study].algorithms]
+    if study is not None and STUDIES[study].randomise:
+        words += ["--randomise"]
     settings = settings_in(words, sweeping=True)
     axes = dataclasses.make_dataclass(
         "axes", axis_fields(settings, everything=shows_everything(argv))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from ppl_jax.packages import own_packages
@@ -45,6 +45,9 @@ class EnvCard:
         view: How it is drawn: "road" from above, "arm" through MuJoCo; None where it cannot be.
         camera: Camera of an arm's view: lookat (m), distance (m), azimuth and elevation (degrees).
         physics: Names of the physics engines that can run it; () where there is no choice.
+        ranges: Makes the settings class that its worlds are drawn within where `randomise` is on (a
+            function, so that the card needs no JAX; the environment then has
+            `with_ranges(params, ranges)`); None where it cannot be randomised.
         predictors: Names of its prediction steps.
         experts: Names of its experts.
         neural_expert: A neural expert is shipped.
@@ -67,6 +70,7 @@ class EnvCard:
     view: Literal["road", "arm"] | None = None
     camera: Changes = dataclasses.field(default_factory=dict)
     physics: tuple[str, ...] = ()
+    ranges: Callable[[], Any] | None = None
     predictors: tuple[str, ...] = ("simulator",)
     experts: tuple[str, ...] = ("scripted",)
     neural_expert: bool = False

@@ -40,6 +40,7 @@ class HParams:
     Attributes:
         learning_rate, expert_noise, prediction_noise: See the fields' own text.
         method, gate, predictor: Traced settings that these own.
+        world: The ranges that worlds are drawn within; `NoHParams` where they are not randomised.
     """
 
     learning_rate: jax.Array | float = setting(
@@ -62,6 +63,7 @@ class HParams:
     method: Any = dataclasses.field(default_factory=NoHParams)
     gate: Any = dataclasses.field(default_factory=NoHParams)
     predictor: Any = dataclasses.field(default_factory=NoHParams)
+    world: Any = dataclasses.field(default_factory=NoHParams)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +113,12 @@ class TrainConfig:
         group="run",
         common=True,
     )
+    randomise: bool = setting(
+        False,
+        "Draw each scenario's dynamics within the environment's ranges, which are settings then.",
+        group="world",
+        common=True,
+    )
     prediction_horizon: int = setting(
         10, "H: steps of the lookahead that the expert sees.", low=1, group="predictor", common=True
     )
@@ -153,7 +161,7 @@ class TrainConfig:
 
 
 OWNED_CONFIG = ("method",)
-OWNED_HPARAMS = ("method", "gate", "predictor")
+OWNED_HPARAMS = ("method", "gate", "predictor", "world")
 T = TypeVar("T")
 
 
@@ -273,6 +281,54 @@ def check_unique(*classes: type) -> None:
                     f"setting {name!r} of {cls.__name__} is one of {seen[name].__name__} already"
                 )
             seen[name] = cls
+
+
+def world_ranges(env: str, randomise: bool) -> Any:
+    """The default of `HParams.world`: the environment's ranges where `randomise` is on.
+
+    Raises:
+        ValueError: If the environment has none.
+    """
+    ranges = card(env).ranges
+    if not randomise:
+        return NoHParams()
+    if ranges is None:
+        raise ValueError(f"randomise must be off for {env!r}: it has no ranges to draw worlds from")
+    return ranges()
+
+
+def range_names(env: str) -> tuple[str, ...]:
+    """Names of the settings that only randomised runs in an environment have."""
+    ranges = card(env).ranges
+    return () if ranges is None else tuple(settings_fields(type(ranges())))
+
+
+def check_range(env: str, name: str) -> None:
+    """Refuse a range as a setting of a run that is not randomised.
+
+    Raises:
+        ValueError: One line that says how to randomise it.
+    """
+    if name in range_names(env):
+        raise ValueError(
+            f"{name} is a range of randomised worlds: add --randomise (randomise=True)"
+        )
+
+
+def env_params(env: Any, params: Any, hparams: HParams) -> Any:
+    """An environment's parameters as a run with these settings has them.
+
+    Args:
+        env: The environment; one whose card has ranges has `with_ranges(params, ranges)`.
+        params: Its parameters, such as `env.default_params`.
+        hparams: Settings of the run.
+
+    Returns:
+        Parameters within the ranges `hparams.world`; the very same ones where it has none.
+    """
+    if isinstance(hparams.world, NoHParams):
+        return params
+    return env.with_ranges(params, hparams.world)
 
 
 PRESETS = ("default", "paper", "reference")

@@ -21,7 +21,7 @@ class About:
         help: One sentence, with the unit.
         low, high: Smallest and largest value that is allowed; None where there is no bound.
         choices: Allowed values of a name, or None.
-        group: Group on the command line: "run", "method", "gate", "predictor", "expert" or
+        group: Group on the command line: "run", "world", "method", "gate", "predictor", "expert" or
             "evaluation".
         common: Shown by `--help`, not only by `--help-all`.
     """

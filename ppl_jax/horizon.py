@@ -30,7 +30,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.config import HParams, TrainConfig, env_params
 from ppl_jax.gates import gate
 from ppl_jax.predictors import Act, predict, predictor
 from ppl_jax.types import Array, DecisionPoint, Env, Expert
@@ -232,7 +232,8 @@ def watch(
     """
     predicted_transition = predictor(config.predictor).make(env)
     decide = gate(config.gate).decide
-    params, scale = env.default_params, jnp.asarray(env.spec.observation_scale)
+    params = env_params(env, env.default_params, hparams)
+    scale = jnp.asarray(env.spec.observation_scale)
     most = config.method.max_preference_horizon
 
     def transition(*args: Any) -> Any:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.algorithms.base import Algorithm
-from ppl_jax.config import HParams, TrainConfig, as_arrays
+from ppl_jax.config import HParams, TrainConfig, as_arrays, env_params
 from ppl_jax.losses import Metrics
 from ppl_jax.predictors import add_noise, predict, predictor
 from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory
@@ -80,7 +80,7 @@ class Problem:
         expert: Acts during takeovers; None where somebody outside does.
         algorithm: The method.
         config: Static settings.
-        params: The environment's parameters.
+        params: The environment's parameters; a run has them as `params_of` says.
         transition: `transition(key, state, action, params, hparams=...)` of the predictor.
     """
 
@@ -122,10 +122,15 @@ def make_problem(
     )
 
 
+def params_of(problem: Problem, hparams: HParams) -> PyTree:
+    """The environment's parameters in a run with these settings."""
+    return env_params(problem.env, problem.params, hparams)
+
+
 def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
     """A learner before its first step."""
     key, key_algorithm, key_env = jax.random.split(key, 3)
-    _, env_state = problem.env.reset(key_env, problem.params)
+    _, env_state = problem.env.reset(key_env, params_of(problem, hparams))
     zero = jnp.zeros((), jnp.int32)
     return Learner(
         algorithm=problem.algorithm.init(key_algorithm),
@@ -165,7 +170,8 @@ def query_expert(
     """The expert's action [A], with its noise."""
     assert problem.expert is not None  # else the caller of `interact` says what it does
     key_expert, key_noise = jax.random.split(key)
-    action = problem.expert(key_expert, learner.env_state, observation, problem.params)
+    params = params_of(problem, learner.hparams)
+    action = problem.expert(key_expert, learner.env_state, observation, params)
     noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
     return jnp.clip(action + noise, -1.0, 1.0)
 
@@ -187,7 +193,7 @@ def look_ahead(problem: Problem, learner: Learner, key: jax.Array, action: jax.A
         # whose expert is in control do (a core is as fast with one run as with many)
         ahead = jax.custom_batching.sequential_vmap(ahead)
     only = dataclasses.replace(learner, algorithm=None, counters=None)  # what it reads
-    trajectory = ahead(only, key_predict, action, problem.params)
+    trajectory = ahead(only, key_predict, action, params_of(problem, learner.hparams))
     noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
     return dataclasses.replace(trajectory, observation=noisy)
 
@@ -243,7 +249,8 @@ def interact(
         started: An expert in control was not in the step before.
         action: The expert's [A], where somebody outside says it.
     """
-    env, params, state = problem.env, problem.params, learner.env_state
+    env, state = problem.env, learner.env_state
+    params = params_of(problem, learner.hparams)
     keys = jax.random.split(learner.key, KEYS)
     key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
     observation = env.observe(state, params)

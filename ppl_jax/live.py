@@ -24,6 +24,7 @@ from ppl_jax.interaction import (
     interact,
     learn,
     make_problem,
+    params_of,
     sample_novice_action,
     summarise,
     transition_of,
@@ -107,7 +108,8 @@ def predict_path(
 ) -> Trajectory:
     """See `LiveFunctions`."""
     key_propose, key_predict = jax.random.split(learner.key)
-    observation = problem.env.observe(learner.env_state, problem.params)
+    params = params_of(problem, learner.hparams)
+    observation = problem.env.observe(learner.env_state, params)
     novice_action = sample_novice_action(problem, learner, key_propose, observation)
     return predict(
         problem.env,
@@ -115,7 +117,7 @@ def predict_path(
         key_predict,
         learner.env_state,
         action=jnp.where(mine, action, jnp.clip(novice_action, -1.0, 1.0)),
-        params=problem.params,
+        params=params,
         horizon=problem.config.prediction_horizon,
         place=place,
     )
@@ -144,7 +146,7 @@ def fit(problem: Problem, learner: Learner, updates: int) -> tuple[Learner, Metr
 def restart(problem: Problem, learner: Learner) -> Learner:
     """See `LiveFunctions`."""
     key, key_reset = jax.random.split(learner.key)
-    _, state = problem.env.reset(key_reset, problem.params)
+    _, state = problem.env.reset(key_reset, params_of(problem, learner.hparams))
     return dataclasses.replace(learner, env_state=state, key=key, takeover=jnp.zeros((), bool))
 
 

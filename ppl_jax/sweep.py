@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ppl_jax import experts
-from ppl_jax.config import HParams, TrainConfig
+from ppl_jax.config import HParams, TrainConfig, env_params
 from ppl_jax.evaluation import Episodes, make_evaluate
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.interaction import Counters, Learner
@@ -66,7 +66,8 @@ def make_run(
     program.
 
     Args:
-        env: The environment; its held-out parameters are an argument of the run, not a constant.
+        env: The environment; its held-out parameters are an argument of the run, not a constant,
+            and the run evaluates in its own randomised worlds where it has ranges.
         functions: The method's functions (`ppl_jax.training.make_train`).
         config: Static settings.
         keep_policy: Return (RunHistory, the policy's layers at the end) instead.
@@ -93,6 +94,7 @@ def make_run(
 
     def run(key: jax.Array, hparams: HParams, held_out: PyTree) -> Any:
         learner, curves = functions.init(key, hparams), []
+        held_out = env_params(env, held_out, hparams)
 
         def part(learner: Learner, _: None, steps: int = every) -> tuple[Learner, RunHistory]:
             learner = functions.run_chunk(learner, steps // interval)[0]

@@ -28,6 +28,7 @@ from ppl_jax.interaction import (
     interact,
     learn,
     make_problem,
+    params_of,
     query_expert,
     sample_novice_action,
     summarise,
@@ -149,7 +150,7 @@ def make_takeovers(problem: Problem) -> Takeovers:
 
 def decide(problem: Problem, takeovers: Takeovers, learner: Learner, key: jax.Array) -> jax.Array:
     """Whether the expert takes the next block of K steps."""
-    env, params = problem.env, problem.params
+    env, params = problem.env, params_of(problem, learner.hparams)
     key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
     observation = env.observe(learner.env_state, params)
     action = sample_novice_action(problem, learner, key_propose, observation)

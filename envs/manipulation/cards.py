@@ -1,10 +1,20 @@
 """The cards of the arm environments."""
 
+from typing import Any
+
 from ppl_jax.cards import EnvCard, ExpertCard
 
 _HAND = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
 _PHYSICS = ("analytic", "mjx", "mujoco_c")
 _MARKER = 1.64  # robosuite's normalised reward for one wiped marker
+
+
+def arm_ranges() -> Any:
+    """The ranges of the arm environments' domain randomisation, at their defaults."""
+    from envs.manipulation.randomisation import Ranges
+
+    return Ranges()
+
 
 # each expert starts as a clone of the scripted one, with little noise, and is improved gently
 _CONFIG = {"demonstrations": 100_000, "critic_batches": 10, "scaling": "world"}
@@ -22,6 +32,7 @@ TABLE_WIPING = EnvCard(
     control_rate=20.0,
     actions=_HAND,
     physics=_PHYSICS,
+    ranges=arm_ranges,
     view="arm",
     camera={"lookat": (0.05, 0.0, 0.95), "distance": 1.55, "azimuth": 215, "elevation": -38},
     neural_expert=True,
@@ -53,6 +64,7 @@ NUT_ASSEMBLY = EnvCard(
     control_rate=20.0,
     actions=(*_HAND, "gripper"),
     physics=_PHYSICS,
+    ranges=arm_ranges,
     view="arm",
     camera={"lookat": (0.0, -0.08, 0.95), "distance": 1.25, "azimuth": 150, "elevation": -28},
     neural_expert=True,
@@ -81,6 +93,7 @@ LIFT = EnvCard(
     control_rate=20.0,
     actions=(*_HAND, "gripper"),
     physics=("mjx",),
+    ranges=arm_ranges,
     view="arm",
     camera={"lookat": (-0.06, -0.02, 0.92), "distance": 0.9, "azimuth": 150, "elevation": -25},
     demonstrations=10_000,

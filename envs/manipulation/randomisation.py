@@ -49,25 +49,42 @@ class Ranges:
     """
 
     friction_range: jax.Array | float = setting(
-        0.0, "r: friction of contacts within [1/(1+r), 1+r] of its own.", low=0, group="world"
+        0.0,
+        "r: friction of contacts within [1/(1+r), 1+r] of its own.",
+        low=0,
+        group="world",
+        common=True,
     )
     mass_range: jax.Array | float = setting(
-        0.0, "r: mass of what is handled within [1/(1+r), 1+r].", low=0, group="world"
+        0.0, "r: mass of what is handled within [1/(1+r), 1+r].", low=0, group="world", common=True
     )
     damping_range: jax.Array | float = setting(
-        0.0, "r: damping of the arm's joints within [1/(1+r), 1+r].", low=0, group="world"
+        0.0,
+        "r: damping of the arm's joints within [1/(1+r), 1+r].",
+        low=0,
+        group="world",
+        common=True,
     )
     gain_range: jax.Array | float = setting(
-        0.0, "r: stiffness of the controller within [1/(1+r), 1+r].", low=0, group="world"
+        0.0,
+        "r: stiffness of the controller within [1/(1+r), 1+r].",
+        low=0,
+        group="world",
+        common=True,
     )
     start_noise: jax.Array | float = setting(
-        0.0, "Extra noise on the joints at a start: standard deviation, rad.", low=0, group="world"
+        0.0,
+        "Extra noise on the joints at a start: standard deviation, rad.",
+        low=0,
+        group="world",
+        common=True,
     )
     sensor_noise: jax.Array | float = setting(
         0.0,
         "Noise on observations: standard deviation as a share of their scale.",
         low=0,
         group="world",
+        common=True,
     )
 
 

@@ -17,7 +17,9 @@ from envs.registry import make
 from experiments.engine.policy_file import load_meta, load_policy
 from experiments.engine.run_folder import EVALUATION, POLICY, RunFolder
 from experiments.engine.runtime import UserError
+from experiments.engine.settings import RunSettings
 from ppl_jax import experts
+from ppl_jax.config import HParams, as_arrays, env_params
 from ppl_jax.evaluation import Episodes, make_evaluate
 from ppl_jax.experts import SavedPolicy, neural_expert
 from ppl_jax.types import Env, EnvSpec, Expert
@@ -58,12 +60,27 @@ def arrays_of(policy: SavedPolicy) -> SavedPolicy:
 
 
 def evaluate_policy(
-    env: Env, policy: SavedPolicy, step: int, on: str = "held_out"
+    env: Env,
+    policy: SavedPolicy,
+    step: int,
+    on: str = "held_out",
+    *,
+    hparams: HParams | None = None,
 ) -> list[EvaluationRow]:
-    """Play every held-out (or training) scenario of `env` once, without the expert."""
+    """Play every scenario of a pool once, without the expert.
+
+    Args:
+        env: The environment.
+        policy: The policy.
+        step: For the rows.
+        on: "held_out" or "training".
+        hparams: Settings of the run whose worlds, if they are randomised, are played in.
+    """
     policy = arrays_of(policy)
     arrays = (policy.weights, policy.obs_mean, policy.obs_scale)
     params = env.held_out_params if on == "held_out" else env.default_params
+    if hparams is not None:
+        params = env_params(env, params, as_arrays(hparams))
     episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
     return rows_of(episodes, env.scenario_numbers(params), step)
 
@@ -145,6 +162,22 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
     names = ("scenarios", "held_out_scenarios")
     options = {name: config[name] for name in names if config[name] is not None}
     return config["env"], {"physics": run_physics(config), **options}
+
+
+def run_hparams(run: Path) -> HParams | None:
+    """The traced settings of a run folder whose worlds are randomised; None of any other.
+
+    Raises:
+        UserError: If the folder's config.json cannot be read.
+    """
+    if run.is_file():
+        return None
+    try:
+        config = RunFolder(run).config()
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    randomised = config.get("settings", {}).get("randomise", False)
+    return RunSettings.from_json(config).hparams if randomised else None
 
 
 def run_physics(config: Mapping[str, Any]) -> str:
@@ -234,4 +267,5 @@ def evaluate_run(
     if physics is not None:
         options["physics"] = physics
     env = make_env(name, options)
-    return evaluate_policy(env, read_policy(source, env.spec), 0)
+    policy = read_policy(source, env.spec)
+    return evaluate_policy(env, policy, 0, hparams=run_hparams(run))

@@ -359,7 +359,8 @@ class _Runner:
         note = f"human data {human}"
         if chunk.evaluate:
             policy, on = saved_policy(self.env, layers), self.settings.evaluate_on
-            rows = evaluate_policy(self.env, policy, chunk.step, on)
+            hparams = self.settings.hparams
+            rows = evaluate_policy(self.env, policy, chunk.step, on, hparams=hparams)
             scores = summarise_episodes(rows)
             self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
             row |= {f"eval/{name}": value for name, value in scores.items()}

@@ -11,7 +11,15 @@ import numpy as np
 from envs.registry import check_physics, known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
-from ppl_jax.config import HParams, TrainConfig, catalogue, replace, validate, values
+from ppl_jax.config import (
+    HParams,
+    TrainConfig,
+    catalogue,
+    replace,
+    validate,
+    values,
+    world_ranges,
+)
 from ppl_jax.gates import gate
 from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.predictors import predictor
@@ -26,7 +34,8 @@ RENAMED = {
 RENAMED_VALUES = {
     "gate": {"departs": "deviates_from_expert", "unlikely": "action_probability"},
 }
-ADDED = {"physics": "auto"}  # settings that older files lack, and the value those runs had
+# settings that older files lack, and the value that those runs had
+ADDED = {"physics": "auto", "randomise": False}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +87,7 @@ class RunSettings:
         try:
             given = {name: content[name] for name in _PLAIN}
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
-            config, hparams = with_values(given["algorithm"], found)
+            config, hparams = with_values(given["env"], given["algorithm"], found)
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"config.json cannot be read: {error}") from error
         return RunSettings(**given, config=config, hparams=hparams)
@@ -121,11 +130,11 @@ def traced_values(settings: RunSettings) -> dict[str, float]:
     return {name: float(np.asarray(one.value)) for name, one in mine.items() if one.traced}
 
 
-def with_values(algorithm: str, given: Mapping[str, Any]) -> tuple[TrainConfig, HParams]:
-    """The settings of a run from all of their values.
+def with_values(env: str, algorithm: str, given: Mapping[str, Any]) -> tuple[TrainConfig, HParams]:
+    """The settings of a run in an environment from all of their values.
 
     Raises:
-        ValueError: If one is unknown.
+        ValueError: If one is unknown, or the environment cannot be randomised as they say.
     """
     spec = algorithms.method(algorithm)
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
@@ -134,6 +143,7 @@ def with_values(algorithm: str, given: Mapping[str, Any]) -> tuple[TrainConfig, 
         method=spec.hparams(),
         gate=gate(given.get("gate", config.gate)).hparams(),
         predictor=predictor(given.get("predictor", config.predictor)).hparams(),
+        world=world_ranges(env, given.get("randomise", config.randomise)),
     )
     return replace(config, hparams, **given)
 

@@ -185,6 +185,8 @@ class Sweep:
     """Settings to start from."""
     total_steps: int | None = None
     """Environment steps of each run."""
+    randomise: bool = False
+    """Draw each scenario's dynamics within the environment's ranges, which are axes then."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
     expert: str = "scripted"
@@ -212,10 +214,22 @@ class Sweep:
 @hide_unset
 @dataclasses.dataclass(frozen=True)
 class Robustness(Sweep):
-    """Train under noise on predicted states (or on the expert's actions); resumes."""
+    """Train under noise on predicted states, on the expert's actions, or in randomised worlds.
 
-    study: Literal["prediction_noise", "expert_noise"] = "prediction_noise"
-    """Whose noise."""
+    It resumes.
+    """
+
+    study: Literal[
+        "prediction_noise",
+        "expert_noise",
+        "friction",
+        "mass",
+        "damping",
+        "gains",
+        "start_noise",
+        "sensor_noise",
+    ] = "prediction_noise"
+    """Whose noise, or what each scenario draws within ever wider ranges."""
     out: Path = Path("robustness")
     """Folder of the result files; finished runs in it are kept."""
 
@@ -411,6 +425,9 @@ class Recording:
     """Write a Minari data set of this name instead, such as driving/person-v0."""
 
 
+BenchPart = Literal["envs", "training", "experts", "methods", "seeds", "sweep", "physics"]
+
+
 @hide_unset
 @dataclasses.dataclass
 class Bench:
@@ -418,14 +435,9 @@ class Bench:
 
     repeats: int = 5
     """Repeats of each figure; medians are reported."""
-    parts: tuple[Literal["envs", "training", "experts", "methods", "seeds", "sweep"], ...] = (
-        "envs",
-        "training",
-        "experts",
-        "methods",
-    )
+    parts: tuple[BenchPart, ...] = ("envs", "training", "experts", "methods")
     """Parts to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
-    against single ones) take long."""
+    against single ones) take long; physics is a table of the arms on each engine."""
     out: Path | None = None
     """Also write the figures to this JSON file."""
 

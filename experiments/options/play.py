@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes
 from experiments.options.commands import Play
 from experiments.options.settings import is_given, option_fields, settings_in, shows_everything
 
-_GROUPS = ("run", "method", "predictor")  # a person is the gate and the expert
+_GROUPS = ("run", "world", "method", "predictor")  # a person is the gate and the expert
 
 
 def play_options(argv: Sequence[str]) -> tuple[type, Callable[[Any], Any]]:

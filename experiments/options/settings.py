@@ -13,11 +13,11 @@ from envs.registry import known, registered
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RENAMED, RENAMED_VALUES
 from ppl_jax import algorithms
-from ppl_jax.config import Setting, catalogue
+from ppl_jax.config import Setting, catalogue, check_range, range_names
 from ppl_jax.gates import registered_gates
 from ppl_jax.predictors import registered_predictors
 
-GROUPS = ("run", "method", "gate", "predictor", "expert", "evaluation", "output")
+GROUPS = ("run", "world", "method", "gate", "predictor", "expert", "evaluation", "output")
 HELP_ALL = "--help-all"
 
 
@@ -53,6 +53,12 @@ def is_given(argv: Sequence[str], option: str) -> bool:
     return any(name.replace("_", "-") == option for name in names)
 
 
+def switch(argv: Sequence[str], name: str) -> bool | None:
+    """What a command line says last of a switch: `--name`, `--no-name`, or nothing (None)."""
+    said = {f"--{name}": True, f"--no-{name}": False}
+    return next((said[word] for word in reversed(argv) if word in said), None)
+
+
 def environments_in(argv: Sequence[str]) -> list[str]:
     """The known environments that a command line names."""
     return [word for word in argv if not word.startswith("-") and known(word)]
@@ -66,7 +72,8 @@ def settings_in(argv: Sequence[str], *, sweeping: bool = False) -> dict[str, Set
         sweeping: Methods, gates and predictors may be several.
 
     Raises:
-        UserError: If a method, gate, predictor or preset is unknown, or an old name is used.
+        UserError: If a method, gate, predictor or preset is unknown, or an old name is used, or a
+            range is given for worlds that are not randomised.
     """
     refuse_old_names(argv)
     env = (environments_in(argv) or ["driving"])[0]
@@ -76,14 +83,19 @@ def settings_in(argv: Sequence[str], *, sweeping: bool = False) -> dict[str, Set
     for name in ("gate", "predictor"):
         one = [word_after(argv, f"--{name}")]
         several[name] = (words_after(argv, f"--{name}") or [None]) if sweeping else one
+    randomise = switch(argv, "randomise")
     found: dict[str, Setting] = {}
     try:
         for method in methods:
             for gate in several["gate"]:
                 for predictor in several["predictor"]:
-                    given = {"gate": gate, "predictor": predictor}
+                    given = {"gate": gate, "predictor": predictor, "randomise": randomise}
                     given = {name: value for name, value in given.items() if value is not None}
                     made = algorithms.settings(method, env, preset, **given)
+                    if not made[0].randomise:
+                        for name in range_names(env):
+                            if is_given(argv, f"--{name.replace('_', '-')}"):
+                                check_range(env, name)
                     mine = catalogue(*made)
                     if not algorithms.method(method).gated:
                         mine = {k: s for k, s in mine.items() if s.about.group != "gate"}
@@ -164,11 +176,14 @@ def option_fields(
     return fields
 
 
+_OF_THE_SWEEP = ("total_steps", "randomise")  # one value for all of its runs
+
+
 def axis_fields(settings: Mapping[str, Setting], *, everything: bool) -> list[Any]:
     """Fields of a dataclass with several values of every setting that a sweep may vary."""
     fields = []
     for name, one in settings.items():
-        if name == "total_steps":
+        if name in _OF_THE_SWEEP:
             continue
         listed = typing.get_origin(one.kind) is tuple
         kind: Any = str if listed else kind_of(one)

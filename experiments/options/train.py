@@ -87,9 +87,7 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     if before is not None:
         own |= {name: getattr(before, name) for name in own if hasattr(before, name)}
         held = flat(before.config, before.hparams)
-        settings = settings_in(
-            [before.env, *argv, "--algorithm", before.algorithm, *_gate_and_predictor(held)]
-        )
+        settings = settings_in([before.env, *argv, "--algorithm", before.algorithm, *_owners(held)])
         settings = {
             name: one._replace(value=_like(held[name], one.value)) if name in held else one
             for name, one in settings.items()
@@ -122,9 +120,10 @@ def train_options(argv: Sequence[str]) -> tuple[type, dict[str, Any]]:
     return made, defaults
 
 
-def _gate_and_predictor(held: Mapping[str, Any]) -> list[str]:
-    """The options that name a run's gate and predictor."""
-    return ["--gate", held["gate"], "--predictor", held["predictor"]]
+def _owners(held: Mapping[str, Any]) -> list[str]:
+    """The options that decide which further settings a run has."""
+    worlds = "--randomise" if held["randomise"] else "--no-randomise"
+    return ["--gate", held["gate"], "--predictor", held["predictor"], worlds]
 
 
 def _tenth(settings: Mapping[str, Setting]) -> int:
@@ -213,5 +212,5 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
     return TrainRequest(settings=settings, out=out, resume=False)
 
 
-_DECIDING = ("gate", "predictor")  # the defaults of others depend on them, as shown
+_DECIDING = ("gate", "predictor", "randomise")  # the defaults of others depend on them, as shown
 _NOT_SETTINGS = {name for group in _OWN.values() for name, _, _, _ in group}

@@ -13,9 +13,10 @@ import numpy as np
 
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
-from experiments.engine.evaluate import make_env, named_expert, run_options
+from experiments.engine.evaluate import make_env, named_expert, run_hparams, run_options
 from experiments.engine.runtime import UserError, need
 from ppl_jax import algorithms
+from ppl_jax.config import HParams, as_arrays, env_params
 from ppl_jax.gates import gate
 from ppl_jax.predictors import predict
 from ppl_jax.types import DecisionPoint, Env, Expert
@@ -60,16 +61,28 @@ def render(
     if physics is not None:
         options["physics"] = physics
     env = make_env(name, options)
-    save_frames(out, episode(env, named_expert(run, env), number, steps))
+    played = None if named else run_hparams(Path(run))
+    save_frames(out, episode(env, named_expert(run, env), number, steps, played))
 
 
-def episode(env: Any, act: Expert, number: int, steps: int) -> list[np.ndarray]:
+def episode(
+    env: Any, act: Expert, number: int, steps: int, played: HParams | None = None
+) -> list[np.ndarray]:
     """Pictures of an episode, one per control step.
+
+    Args:
+        env: The environment.
+        act: Who plays.
+        number: Number of the scenario.
+        steps: Most steps to draw.
+        played: Settings of the run whose worlds, if they are randomised, are played in.
 
     Raises:
         UserError: If the environment has no scenario of that number, or cannot be drawn here.
     """
     params = env.held_out_params
+    if played is not None:
+        params = env_params(env, params, as_arrays(played))
     numbers = np.asarray(env.scenario_numbers(params)).tolist()
     if number not in numbers:
         raise UserError(f"scenario must be one of {numbers[0]} to {numbers[-1]}, got {number}")

@@ -24,6 +24,7 @@ class Study:
         axes: Values of each setting.
         total_steps: Factor on the environment's own length, and the evaluations within it.
         evaluations: Over the whole run.
+        randomise: Its runs are in randomised worlds.
     """
 
     title: str
@@ -31,10 +32,12 @@ class Study:
     axes: Values
     length: float = 1.0
     evaluations: int = 5
+    randomise: bool = False
 
 
 NOISES = (0.0, 0.0625, 0.125, 0.25, 0.5, 1.0)
 HORIZONS = (1, 2, 4, 6, 8, 10)
+RANGES = (0.0, 0.1, 0.25, 0.5, 1.0)
 
 # H and the other settings are the paper's own; L beyond an environment's H is left out
 STUDIES = {
@@ -65,6 +68,23 @@ STUDIES = {
         algorithms=("ppl",),
         axes={"predictor": ("simulator", "kinematic")},
     ),
+}
+
+
+def _randomised(title: str, name: str, values: Sequence[float]) -> Study:
+    """A study over one of the ranges that worlds are drawn within."""
+    return Study(title=title, algorithms=("ppl", "pvp"), axes={name: values}, randomise=True)
+
+
+STUDIES |= {
+    "friction": _randomised("randomised friction of contacts", "friction_range", RANGES),
+    "mass": _randomised("randomised mass of what is handled", "mass_range", RANGES),
+    "damping": _randomised("randomised damping of the arm's joints", "damping_range", RANGES),
+    "gains": _randomised("randomised stiffness of the controller", "gain_range", RANGES),
+    "start_noise": _randomised(
+        "noise on the joints at a start", "start_noise", (0, 0.02, 0.05, 0.1)
+    ),
+    "sensor_noise": _randomised("noise on observations", "sensor_noise", (0, 0.01, 0.03, 0.1)),
 }
 
 

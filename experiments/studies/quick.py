@@ -145,6 +145,7 @@ def _train(
     start_jax()
     seeds = _seeds(seed)
     owners = {k: v for k, v in given.items() if k in ("gate", "predictor") and isinstance(v, str)}
+    owners |= {k: v for k, v in given.items() if k == "randomise" and isinstance(v, bool)}
     plain = run_settings(env, method, preset=preset, given=owners)
     one, swept = _split(given, catalogue(plain.config, plain.hparams))
     # the largest value first: it sets what bounds the others, such as the number of pairs

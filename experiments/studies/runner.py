@@ -40,7 +40,7 @@ from experiments.studies.grid import (
 from experiments.studies.results import Results
 from ppl_jax import algorithms
 from ppl_jax.cards import card
-from ppl_jax.config import did_you_mean, values
+from ppl_jax.config import check_range, did_you_mean, values
 
 if TYPE_CHECKING:
     from experiments.options.commands import Sweep
@@ -106,6 +106,10 @@ def _points(command: Sweep, env: str, algorithm: str) -> list[dict[str, Any]]:
     axes = _axes(command, env)
     for name in axes:
         if name not in everyone:
+            try:
+                check_range(env, name)
+            except ValueError as error:
+                raise UserError(str(error)) from error
             raise UserError(f"unknown setting {name!r}{did_you_mean(name, everyone)}")
     mine = {name: values for name, values in axes.items() if name in known}
     return points(mine)
@@ -116,12 +120,19 @@ def _algorithms(command: Sweep) -> tuple[str, ...]:
     return command.algorithms or (study.algorithms if study else ("ppl",))
 
 
+def _worlds(command: Sweep) -> dict[str, bool]:
+    """The setting that randomises the worlds, where command or study do."""
+    study = _study(command)
+    return {"randomise": True} if command.randomise or (study and study.randomise) else {}
+
+
 def _known(command: Sweep, env: str, algorithm: str) -> set[str]:
     """The settings that runs of a method have, under any of the gates and predictors swept over."""
     found: set[str] = set()
     axes = {k: v for k, v in _axes(command, env).items() if k in ("gate", "predictor")}
     for given in points(axes):
         try:
+            given = given | _worlds(command)
             found |= set(values(*algorithms.settings(algorithm, env, command.preset, **given)))
         except ValueError as error:
             raise UserError(str(error)) from error
@@ -132,7 +143,7 @@ def _settings(
     command: Sweep, env: str, algorithm: str, chosen: dict[str, Any], *, seed: int
 ) -> RunSettings | None:
     """Settings of one run; None where a study's L exceeds the environment's H."""
-    given = dict(chosen)
+    given = chosen | _worlds(command)
     if command.total_steps is not None:
         given["total_steps"] = command.total_steps
     common = {name: getattr(command, name) for name in _COMMON}

@@ -307,7 +307,8 @@ class InteractiveTrainer:
         """Play every held-out scenario once without the person, and write the rows."""
         steps, human = self.steps, int(self.learner.counters.human_data)
         if steps not in {row.step for row in self._evaluated()}:
-            rows = evaluate_policy(self.env, self._policy(self.learner), steps)
+            policy, hparams = self._policy(self.learner), self.settings.hparams
+            rows = evaluate_policy(self.env, policy, steps, hparams=hparams)
             self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
         return summarise_episodes([row for row in self._evaluated() if row.step == steps])
 

@@ -13,11 +13,13 @@ from ppl_jax.config import (
     NoHParams,
     TrainConfig,
     catalogue,
+    check_range,
     check_unique,
     did_you_mean,
     preset_values,
     replace,
     settings_fields,
+    world_ranges,
 )
 from ppl_jax.gates import gate
 from ppl_jax.predictors import predictor
@@ -154,26 +156,31 @@ def settings(
         name: The method's name.
         env: Name of the environment.
         preset: "default", "paper" or "reference".
-        **given: Settings by their flat names; `gate` and `predictor` decide which further ones
-            there are.
+        **given: Settings by their flat names; `gate`, `predictor` and `randomise` decide which
+            further ones there are.
 
     Raises:
-        ValueError: If a name is unknown, or the preset is not for the environment.
+        ValueError: If a name is unknown, or the preset is not for the environment, or it cannot be
+            randomised.
     """
     spec = method(name)
     assumed = {**preset_values(preset, env), **spec.changes(card(env))}
     if preset == "default":
         assumed |= spec.tuned
-    chosen = {"gate": TrainConfig().gate, "predictor": TrainConfig().predictor}
+    chosen = {name: getattr(TrainConfig(), name) for name in ("gate", "predictor", "randomise")}
     chosen |= {k: v for k, v in (assumed | given).items() if k in chosen}
-    config = TrainConfig(gate=chosen["gate"], predictor=chosen["predictor"], method=spec.config())
+    config = TrainConfig(**chosen, method=spec.config())
     hparams = HParams(
         method=spec.hparams(),
         gate=gate(chosen["gate"]).hparams(),
         predictor=predictor(chosen["predictor"]).hparams(),
+        world=world_ranges(env, chosen["randomise"]),
     )
     known = catalogue(config, hparams)
     owned = {key: value for key, value in assumed.items() if key in known}
     config, hparams = replace(config, hparams, **owned)
+    for setting in given:
+        if setting not in known:
+            check_range(env, setting)
     config, hparams = replace(config, hparams, **given)
     return spec.derive(config, hparams, given)

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 
+import flax.struct
 import jax
 import numpy as np
 import pytest
 
 import envs
+from experiments.engine.evaluate import evaluate_run
 from experiments.engine.run import algorithm_factory, make_env_and_expert, train
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, traced_values
@@ -22,7 +24,9 @@ from experiments.options.commands import Sweep
 from experiments.studies import grid, quick
 from experiments.studies.runner import plan
 from ppl_jax import sweep as pure
+from ppl_jax.cards import EnvCard
 from ppl_jax.config import replace
+from ppl_jax.fields import setting
 from ppl_jax.training import make_train
 from tests.helpers import ROOT, Probe, call, probe_settings, program
 
@@ -405,6 +409,74 @@ def test_a_run_and_a_sweep_use_the_physics_that_is_asked_for(tmp_path):
     del held["runs"]["engines/ppl/batch_size=8,physics=auto/seed=0"]["settings"]["physics"]
     (out / "sweep.json").write_text(json.dumps(held))
     assert "2 of them done" in call(script, *words).stderr
+
+
+# --- randomised worlds ---
+
+
+@flax.struct.dataclass
+class Gusts:
+    gust: jax.Array | float = setting(0.0, "Added to every action.", low=0, group="world")
+
+
+@flax.struct.dataclass
+class GustyParams:
+    signs: jax.Array
+    ranges: Gusts | None = None
+
+
+class Gusty(Probe):
+    """A probe whose actions are pushed in randomised worlds."""
+
+    name = "gusty"
+
+    def __init__(self):
+        super().__init__()
+        self.default_params = self.held_out_params = GustyParams(self.default_params.signs)
+
+    def with_ranges(self, params, ranges):
+        return dataclasses.replace(params, ranges=ranges)
+
+    def transition(self, key, state, action, params):
+        if params.ranges is not None:
+            action = action + params.ranges.gust
+        return super().transition(key, state, action, params)
+
+
+if "gusty" not in envs.registered():
+    envs.register("gusty", Gusty, EnvCard(ranges=Gusts))
+
+SMALL = {"total_steps": 60, "batch_size": 8, "hidden": (8,), "evaluate_every": 20}
+
+
+def test_a_run_trains_and_is_evaluated_in_its_own_worlds(tmp_path):
+    plain = quick.train("gusty", "ppl", **SMALL)
+    both = quick.train("gusty", "ppl", randomise=True, gust=[0.0, 2.0], **SMALL)
+    calm, rough = (both.curve[both.curve.gust == gust] for gust in (0.0, 2.0))
+    for column in ("human_data_usage", "success", "episodic_return", "length"):
+        assert list(calm[column]) == list(plain.curve[column])
+    assert (rough.length < 5).all()  # two such steps leave the road
+    summary = train(both.settings[1], tmp_path / "run")
+    assert summary["episode_length"] == rough.length.iloc[-1]
+    rows = evaluate_run(tmp_path / "run", None)
+    assert np.mean([row.length for row in rows]) == summary["episode_length"]
+    (tmp_path / "policy.npz").write_bytes((tmp_path / "run" / "policy.npz").read_bytes())
+    rows = evaluate_run(tmp_path / "policy.npz", None)  # a file alone knows no world
+    assert np.mean([row.length for row in rows]) > summary["episode_length"]
+    with pytest.raises(ValueError, match=r"gust is a range of randomised worlds: add --randomise"):
+        quick.train("gusty", "ppl", gust=0.5, **SMALL)
+
+
+def test_runs_in_worlds_of_different_ranges_share_a_program():
+    runs = plan(command("gusty", randomise=True, gust=(0.0, 0.5, 2.0), seeds=2))
+    (group,) = grid.groups(runs)
+    assert len(group.runs) == 6
+    assert {run.settings.hparams.world.gust for run in runs} == {0.0, 0.5, 2.0}
+    assert runs[2].name == "gusty/ppl/gust=0.5/seed=0"
+    with pytest.raises(UserError, match="add --randomise"):
+        plan(command("gusty", gust=(0.0, 0.5)))
+    with pytest.raises(UserError, match="randomise must be off for 'probe'"):
+        plan(command("probe", randomise=True))
 
 
 # --- another axis, and the call for notebooks ---

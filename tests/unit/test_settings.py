@@ -9,7 +9,7 @@ import pytest
 
 import ppl_jax
 from experiments.cli import parse
-from experiments.engine.evaluate import run_options
+from experiments.engine.evaluate import run_hparams, run_options
 from experiments.engine.run import build_env, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError
@@ -36,6 +36,7 @@ from ppl_jax.config import (
     TrainConfig,
     catalogue,
     check_unique,
+    env_params,
     replace,
     validate,
     values,
@@ -57,7 +58,7 @@ def test_every_method_has_valid_settings_that_survive_a_file(name, preset, env):
         return
     config, hparams = algorithms.settings(name, env, preset)
     validate(config, hparams)
-    again = with_values(name, flat(config, hparams))
+    again = with_values(env, name, flat(config, hparams))
     assert values(*again) == values(config, hparams)
     assert config == again[0]
 
@@ -68,7 +69,7 @@ def test_a_setting_has_one_owner_and_every_field_says_what_it_is():
             for one in catalogue(*algorithms.settings(name, "driving", gate=gate_name)).values():
                 assert one.about.help.endswith((".", "them.")), one.name
                 assert one.about.group in (
-                    "run", "method", "gate", "predictor", "expert",
+                    "run", "world", "method", "gate", "predictor", "expert",
                 )  # fmt: skip
 
     @flax.struct.dataclass
@@ -336,3 +337,74 @@ def test_a_config_from_before_physics_could_be_chosen_is_read_and_continued(sche
     held, asked = one_level(content), one_level(settings.as_json())
     with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
         refuse_contradictions(folder.path, held, asked | {"physics": "mjx"})
+
+
+RANGES = ("friction_range", "mass_range", "damping_range", "gain_range", "start_noise")
+RANGES += ("sensor_noise",)
+
+
+@pytest.mark.parametrize("env", ["table_wiping", "nut_assembly", "lift"])
+def test_a_randomised_run_owns_the_ranges_of_its_environment(env):
+    assert not set(RANGES) & set(settings_in([env]))
+    assert set(RANGES) < set(settings_in([env, "--randomise"]))
+    words = ["train", env, "--randomise", "--friction-range", "0.5", "--start-noise", "0.02"]
+    settings = parse(words).settings
+    check(settings)
+    world = settings.hparams.world
+    assert (world.friction_range, world.start_noise, world.mass_range) == (0.5, 0.02, 0.0)
+    content = settings.as_json()
+    assert content["settings"]["randomise"] is True
+    assert content["settings"]["friction_range"] == 0.5
+    assert RunSettings.from_json(content) == settings
+    with pytest.raises(UserError, match="mass_range must not be negative, got -1"):
+        check(parse([*words, "--mass-range", "-1"]).settings)
+
+
+def test_ranges_need_a_randomised_run_and_an_environment_that_has_them():
+    for command in ("train", "sweep", "play"):
+        with pytest.raises(
+            UserError, match="friction_range is a range of randomised worlds: add --"
+        ):
+            parse([command, "table_wiping", "--friction-range", "0.5"])
+    with pytest.raises(UserError, match="add --randomise"):
+        run_settings("table_wiping", given={"friction_range": 0.5})
+    for command in ("train", "sweep"):
+        with pytest.raises(UserError, match="randomise must be off for 'driving'"):
+            parse([command, "driving", "--randomise"])
+    assert parse(["train", "driving", "--no-randomise"]).settings.config.randomise is False
+
+
+def test_a_randomised_run_is_resumed_with_its_ranges(tmp_path):
+    words = ["train", "lift", "--randomise", "--gain-range", "0.25"]
+    settings, folder = parse(words).settings, RunFolder(tmp_path / "run")
+    folder.create(settings.as_json())
+    resumed = ["train", "--resume", "--out", str(folder.path)]
+    assert parse(resumed).settings == settings
+    assert run_hparams(folder.path) == settings.hparams
+    for more, said in (
+        (["--gain-range", "0.5"], "its gain_range is 0.25, asked for 0.5"),
+        (["--no-randomise"], "its randomise is True, asked for False"),
+    ):
+        with pytest.raises(UserError, match=said):
+            parse([*resumed, *more])
+
+
+def test_a_world_that_is_not_randomised_keeps_its_very_parameters():
+    hparams = algorithms.settings("ppl", "table_wiping")[1]
+    params = object()
+    assert env_params(None, params, hparams) is params
+
+
+@pytest.mark.parametrize("study", ["friction", "mass", "damping", "gains", "start_noise"])
+def test_a_range_is_traced_so_a_study_of_it_is_one_program_a_method(study):
+    runs = plan(parse(["robustness", "table_wiping", "--study", study, "--seeds", "2"]))
+    assert all(run.settings.config.randomise for run in runs)
+    assert len(grid.groups(runs)) == 2  # ppl and pvp
+    words = ["--randomise", "--friction-range", "0", "0.5", "--mass-range", "0", "1"]
+    runs = plan(parse(["sweep", "table_wiping", *words, "--seeds", "1"]))
+    assert len(runs) == 4
+    assert len(grid.groups(runs)) == 1
+    worlds = [
+        (r.settings.hparams.world.friction_range, r.settings.hparams.world.mass_range) for r in runs
+    ]
+    assert worlds == [(0, 0), (0, 1), (0.5, 0), (0.5, 1)]
