@@ -95,7 +95,7 @@ def episode(
         place, picture = _arm(env)
     horizon = config.prediction_horizon
 
-    ahead = functools.partial(predict, env, env.transition, key, place=place)
+    ahead = functools.partial(predict, env, env.transition, key, observe=True, place=place)
 
     @jax.jit
     def step(state: Any):
