@@ -56,6 +56,7 @@ def follow(folder):
     return code, re.findall(r"^python (-m own_mjx_scene.*)$", PAGE, re.M)
 
 
+@pytest.mark.timeout(600)  # compiles a step of MJX, which takes two minutes of a free core
 def test_the_page_about_a_scene_of_ones_own_works_line_by_line(tmp_path):
     pytest.importorskip("mujoco")
     code, commands = follow(tmp_path)
