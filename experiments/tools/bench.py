@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.driving.make import make_driving
-from envs.manipulation.scenes.model import SUBSTEPS
 from envs.registry import make
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
+from experiments.tools.bench_physics import arms, bench_physics
 from ppl_jax import algorithms
 from ppl_jax.algorithms.ppl import make_ppl
 from ppl_jax.config import as_arrays
@@ -51,9 +51,14 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     Args:
         repeats: Repeats of each figure; medians are reported.
         parts: Some of "envs", "training", "experts", "methods", "seeds" (methods, and five seeds
-            in one program), "sweep".
-        out: JSON file to write, or None.
+            in one program), "sweep", "physics" (a table of its own, see `bench_physics`).
+        out: JSON file to write (beside it the table of "physics" as CSV), or None.
     """
+    if "physics" in parts:
+        bench_physics(arms(), repeats=repeats, out=None if out is None else out.with_suffix(".csv"))
+        parts = tuple(part for part in parts if part != "physics")
+        if not parts:
+            return {}
     began = time.perf_counter()
     env = make_driving()
     figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
@@ -142,7 +147,7 @@ def _lookahead(env: Any, repeats: int) -> dict[str, float]:
 def arm_figures(
     name: str, repeats: int, batches: tuple[int, ...] = (1, 16, 64, 256)
 ) -> dict[str, float]:
-    """Control steps per second of an arm, its lookahead, compile time, and C MuJoCo's rate.
+    """Control steps per second of an arm, its lookahead, and compile time.
 
     The expert is at the controls until the tool is in contact; its last action is held from there.
     """
@@ -182,27 +187,6 @@ def arm_figures(
         )
     )
     figures[f"{name}_lookahead_10_ms"] = 1e3 * _median_s(lambda: ahead(state), repeats)
-    try:
-        from envs.manipulation.control.on_mujoco_c import begin, torque
-        from envs.manipulation.twins import make_twin
-
-        twin = make_twin(env)
-    except ImportError:
-        return figures
-    twin.place(state)
-    arm = twin.arm
-    _, hold = begin(arm, np.zeros(6), state.goal_rotation)
-
-    def c_mujoco() -> None:
-        for _ in range(SUBSTEPS * 10):
-            arm.mujoco.mj_step1(arm.model, arm.data)
-            arm.data.qfrc_applied[:6] = torque(arm, hold)
-            arm.mujoco.mj_step2(arm.model, arm.data)
-
-    figures[f"{name}_c_mujoco_steps_per_s"] = 10 / _median_s(c_mujoco, repeats)
-    figures[f"{name}_over_c_mujoco"] = (
-        figures[f"{name}_steps_per_s_1"] / figures[f"{name}_c_mujoco_steps_per_s"]
-    )
     return figures
 
 

@@ -69,9 +69,10 @@ def arm_values(q, v, tool):
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_arm_is_c_mujocos(mujoco, name):
-    from envs.manipulation.twins import make_twin
+    from envs.manipulation.drawn import arm_of
+    from envs.manipulation.physics.mujoco_c import nut_xml, wiping_xml
 
-    twin = make_twin(world(name)).arm
+    twin = arm_of(wiping_xml() if name == "table_wiping" else nut_xml())
     tool, model, data = (WIPER if name == "table_wiping" else GRIPPER), twin.model, twin.data
     base = model.body("mount").pos
     random = np.random.default_rng(0)
@@ -121,7 +122,7 @@ def test_arm_and_pressed_wiper_are_mjxs(mujoco):
         [jnp.float32(x) for x in free],
         joints,
     )
-    touch = wipe_contact.press(motion, wiping._TABLE[2], jnp.asarray(free, jnp.float32))
+    touch = wipe_contact.press(motion, jnp.asarray(free, jnp.float32))
     assert float(touch.force[2]) > 5.0
     np.testing.assert_allclose(touch.acceleration, seen.qacc, atol=0.02, rtol=0.02)
 
@@ -135,63 +136,6 @@ def pressed_state():
         if float(jnp.linalg.norm(state.force)) > 10:
             return np.asarray(state.joints, float), np.asarray(state.speeds, float)
     raise AssertionError("the wiper never pressed")
-
-
-# ---- the twin
-
-
-@pytest.mark.parametrize("name", WORLDS)
-def test_twin_moves_alike_in_the_air(mujoco, name):
-    from envs.manipulation.twins import make_twin
-
-    env, twin = world(name), make_twin(world(name))
-    ours = theirs = start(name)
-    random = np.random.default_rng(3)
-    for _ in range(20):
-        action = jnp.float32(random.uniform(-0.4, 0.4, env.spec.action_size)).at[2].set(0.3)
-        ours, _ = transition(name)(ours, action)
-        theirs, _ = twin.transition(KEY, theirs, action, env.default_params)
-    off = np.asarray(env.grip_position(ours)) - np.asarray(env.grip_position(theirs))
-    assert np.linalg.norm(off) < 1e-3
-
-
-def test_twin_presses_alike(mujoco):
-    from envs.manipulation.twins import make_twin
-
-    env, twin = world("table_wiping"), make_twin(world("table_wiping"))
-    act = expert_action("table_wiping")
-    ours = start("table_wiping")
-    while float(jnp.linalg.norm(ours.force)) < 5:
-        ours, _ = transition("table_wiping")(ours, act(ours))
-    theirs = ours
-    for _ in range(10):
-        action = act(ours)
-        ours, one = transition("table_wiping")(ours, action)
-        theirs, other = twin.transition(KEY, theirs, action, env.default_params)
-        np.testing.assert_allclose(ours.force, theirs.force, atol=0.5)
-        np.testing.assert_allclose(one.reward, other.reward, atol=0.02)
-
-
-@pytest.mark.parametrize("index", [0, 1, 3])
-def test_twin_grasps_alike(mujoco, index):
-    """The ring is lifted in both by the same commands, and stays within 5 mm of the other's."""
-    from envs.manipulation.twins import make_twin
-
-    env, twin = world("nut_assembly"), make_twin(world("nut_assembly"))
-    act, step = expert_action("nut_assembly"), transition("nut_assembly")
-    ours = start("nut_assembly", index)
-    while not (bool(ours.touching) and float(ours.command) > 0.98):
-        ours, _ = step(ours, act(ours))
-    theirs = ours
-    for _ in range(15):
-        action = act(ours)
-        ours, _ = step(ours, action)
-        theirs, _ = twin.transition(KEY, theirs, action, env.default_params)
-    assert bool(ours.touching)
-    assert bool(theirs.touching)
-    assert float(ours.position[2]) > 0.86
-    assert float(theirs.position[2]) > 0.86
-    np.testing.assert_allclose(ours.position, theirs.position, atol=5e-3)
 
 
 # ---- properties
@@ -317,17 +261,18 @@ def test_contact_does_not_vanish():
     q, last = np.asarray(pressed_state()[0]), 0.0
     for depth in (0.0005, 0.002, 0.008):
         at = arm.frames([jnp.float32(x) for x in q], WIPER)
+        x, y, _ = at.position
+        at = at._replace(position=(x, y, jnp.float32(wipe_contact.TABLE_TOP - depth)))
         columns = arm.jacobian(at)
         mass = arm.mass_matrix(at, WIPER)
         zero = [jnp.zeros(())] * 6
         motion = operational_space.Motion(
             at, columns, operational_space.twist_of(columns, zero), mass, zero, zero
         )
-        table = float(at.position[2]) + depth
         forces = []
         for begin in (jnp.zeros(6), jnp.full(6, 50.0)):
             for _ in range(4):  # each physics step starts where the last one ended
-                touch = wipe_contact.press(motion, table, begin)
+                touch = wipe_contact.press(motion, begin)
                 begin = touch.acceleration
             forces.append(float(touch.force[2]))
         assert forces[0] > last + 0.5
@@ -350,7 +295,7 @@ def test_wiping_needs_pressure_and_the_face():
     at = arm.frames([jnp.float32(x) for x in np.asarray(state.joints)], WIPER)
     site = np.array([float(x) for x in at.position])
     for lift, expected in ((0.001, False), (-0.001, True), (-0.03, False)):
-        moved = at._replace(position=(site[0], site[1], wiping._TABLE[2] + lift))
+        moved = at._replace(position=(site[0], site[1], wipe_contact.TABLE_TOP + lift))
         level = moved._replace(rotation=((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
         spots = jnp.array([[site[0], site[1]], [site[0] + 0.03, site[1]]])
         assert list(np.asarray(wiping.under_face(level, spots))) == [expected, False]

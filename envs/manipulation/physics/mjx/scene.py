@@ -328,7 +328,7 @@ class Scene:
         if self.solver == "mjx":
             x = mjx()
             data = x.make_constraint(put, x.factor_m(put, data))
-            data = data.replace(qacc_smooth=x.solve_m(put, data, data.qfrc_smooth))
+            data = data.replace(qacc_smooth=private("smooth").solve_m(put, data, data.qfrc_smooth))
             if data._impl.efc_J.size:
                 return x.solve(put, data)
             return data.replace(qacc=data.qacc_smooth)

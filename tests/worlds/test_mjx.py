@@ -1,0 +1,166 @@
+"""MJX as this package uses it: its repairs, its contact rows, and the solver beside its own."""
+
+import functools
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs.manipulation.physics.mjx import newton, rows
+from envs.manipulation.physics.mjx.repairs import mjx, private
+from envs.manipulation.physics.mjx.scene import Scene
+
+pytest.importorskip("mujoco.mjx")
+
+BOX = """
+<mujoco><option timestep="0.002" cone="{cone}" impratio="{ratio}"/>
+<worldbody><geom name="floor" type="plane" size="1 1 .1" friction="{friction} .005 .0001"/>
+<body name="arm" pos="0 0 .5"><joint name="swing" axis="0 1 0" range="-1 .1" limited="true"
+  frictionloss=".02" damping=".05"/>
+<geom name="arm" type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
+</body>
+<body name="box" pos="0 0 .049"><freejoint name="box"/>
+<geom name="box" type="box" size=".05 .05 .05" friction="{friction} .005 .0001"/></body>
+</worldbody></mujoco>"""
+
+
+@functools.cache
+def boxes(cone, solver):
+    return Scene(BOX.format(cone=cone, ratio=5, friction=0.6), solver=solver)
+
+
+def moving(scene):
+    velocity = np.array([0.4, 0.8, -0.3, 0.1, 0.5, -0.2, 0.3], np.float32)
+    start = scene.start()
+    return start.replace(qpos=start.qpos.at[0].set(0.12), qvel=jnp.asarray(velocity))
+
+
+def chain(links):
+    """MJCF of a chain of hinges."""
+    text = ""
+    for index in reversed(range(links)):
+        axis = "0 1 0" if index % 2 else "0 0 1"
+        text = f"""<body pos="0 0 .1"><joint axis="{axis}"/>
+<geom type="capsule" fromto="0 0 0 0 0 .1" size=".01" contype="0" conaffinity="0"/>{text}</body>"""
+    return f"<mujoco><option timestep='0.002'/><worldbody>{text}</worldbody></mujoco>"
+
+
+def kinematics_of(scene, count):
+    """Frames of `count` chains, compiled with the repair and without."""
+    random = np.random.default_rng(0)
+    given = jnp.asarray(random.normal(size=(count, scene.model.nq)), jnp.float32)
+
+    def frames(qpos):
+        def one(qpos):
+            data = scene.data(scene.start().replace(qpos=qpos))
+            return mjx().kinematics(scene.put, data).xpos
+
+        return jax.vmap(one)(qpos)
+
+    math = private("math")
+    repaired = jax.jit(frames).lower(given).compile()
+    barred = math.quat_mul
+    math.quat_mul = barred.__wrapped__
+    try:
+        plain = jax.jit(lambda qpos: frames(qpos)).lower(given).compile()
+    finally:
+        math.quat_mul = barred
+    return given, repaired, plain
+
+
+def test_the_repair_changes_no_number():
+    given, repaired, plain = kinematics_of(Scene(chain(6)), 1)
+    np.testing.assert_allclose(repaired(given), plain(given), atol=1e-6)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")
+def test_the_repair_is_still_needed():
+    """Says so when XLA or MJX no longer computes every ancestor anew for each joint."""
+    given, repaired, plain = kinematics_of(Scene(chain(9)), 16)
+
+    def seconds(program):
+        jax.block_until_ready(program(given))
+        times = []
+        for _ in range(5):
+            began = time.process_time()
+            jax.block_until_ready(program(given))
+            times.append(time.process_time() - began)
+        return min(times)
+
+    ratio = seconds(plain) / seconds(repaired)
+    assert ratio > 3, (
+        f"MJX without the barrier behind quat_mul takes {ratio:.1f} times as long: the repair in "
+        "envs/manipulation/physics/mjx/repairs.py is no longer needed, remove it"
+    )
+
+
+def test_a_step_calls_no_lapack():
+    scene = boxes("elliptic", "newton")
+    step = jax.jit(lambda bodies: scene.step(scene.data(bodies), lambda data: data).qpos)
+    text = step.lower(moving(scene)).as_text()
+    assert "lapack" not in text
+    assert "cholesky" not in text, "MJX factors a matrix by LAPACK in a step again"
+
+
+def test_contact_rows_are_mjxs():
+    scene = boxes("elliptic", "newton")
+
+    @jax.jit
+    def both(bodies):
+        seen = {}
+
+        def control(data):
+            seen["data"] = data
+            return data
+
+        scene.step(scene.data(bodies), control)
+        data = seen["data"]
+        made = mjx().make_constraint(scene.put, data)._impl
+        return rows.cones(scene, scene.put, data), rows.rows(scene, scene.put, data), made
+
+    ours, others, theirs = jax.device_get(both(moving(scene)))
+    count, size = len(others.weight), scene.model.nv
+    contact = theirs.efc_J[count:].reshape(-1, 3, size)
+    closed = np.any(contact != 0, (1, 2))
+    assert closed.sum() == 4
+    jacobian = np.transpose(ours.jacobian, (2, 1, 0))[:, [2, 0, 1]]
+    np.testing.assert_allclose(jacobian[closed], contact[closed], atol=1e-6)
+    reference = ours.reference.T[:, [2, 0, 1]]
+    np.testing.assert_allclose(
+        reference[closed], theirs.efc_aref[count:].reshape(-1, 3)[closed], rtol=2e-4, atol=1e-3
+    )
+    np.testing.assert_allclose(
+        ours.weight[closed], theirs.efc_D[count:].reshape(-1, 3)[closed, 0], rtol=1e-4
+    )
+    assert np.all(ours.weight[~closed] == 0)
+    np.testing.assert_allclose(others.jacobian, theirs.efc_J[:count])
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_newton_solves_what_mjx_solves(cone):
+    found = {}
+    for solver in ("newton", "mjx"):
+        scene = boxes(cone, solver)
+        found[solver] = jax.jit(
+            lambda bodies, scene=scene: scene.advance(
+                bodies, lambda data: data, lambda data: data.qacc
+            )
+        )(moving(scene))
+    ours, theirs = found["newton"][0], found["mjx"][0]
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=2e-4)
+    np.testing.assert_allclose(ours.qvel, theirs.qvel, atol=2e-2)
+
+
+@pytest.mark.parametrize("size", [3, 8, 9, 14, 21])
+def test_solving_without_lapack(size):
+    random = np.random.default_rng(size)
+    half = random.normal(size=(size, size)).astype(np.float32)
+    matrix, right = half @ half.T + size * np.eye(size, dtype=np.float32), half[0]
+    np.testing.assert_allclose(
+        jax.jit(newton.solve_spd)(matrix, right),
+        np.linalg.solve(matrix.astype(float), right),
+        rtol=1e-4,
+        atol=1e-5,
+    )
