@@ -142,7 +142,6 @@ def _driving(env: Env, state: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
 
 
 def _arm(env: Any) -> tuple[Callable[[Any], jax.Array], Draw]:
-    need("mujoco", "manipulation", f"drawing {env.name}")
     try:
         from envs.manipulation.rendering import ArmPaths, ArmScene
 

@@ -60,11 +60,6 @@ def _installed(module: str) -> bool:
 PIECES = (
     Piece(name="render", what="pictures, GIFs and MP4 films", modules=("PIL", "av")),
     Piece(name="plot", what="figures", modules=("matplotlib",)),
-    Piece(
-        name="manipulation",
-        what="pictures of the arms, C MuJoCo twin",
-        modules=("mujoco", "mujoco.mjx"),
-    ),
     Piece(name="brax", what="the brax adapter", modules=("brax",)),
     Piece(name="ray", what="sweeps on a Ray cluster", modules=("ray",)),
     Piece(

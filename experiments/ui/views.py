@@ -24,7 +24,7 @@ from ppl_jax.types import Env
 PICTURE = (480, 640)  # height and width
 
 
-_NEEDS = {"arm": (("mujoco", "manipulation"), ("PIL", "ui"))}  # view -> (module, extra)
+_NEEDS = {"arm": (("PIL", "ui"),)}  # view -> (module, extra)
 
 
 def display_of(env_name: str) -> EnvCard:

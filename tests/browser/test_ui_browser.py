@@ -155,7 +155,6 @@ def test_a_person_drives_with_keys_and_a_gamepad(tmp_path):
 
 
 def test_the_arm_is_shown_and_a_recording_replayed(tmp_path):
-    pytest.importorskip("mujoco")
     out = tmp_path / "run"
     words = ["play", "table_wiping", "--total-steps", "80", "--no-evaluate"]
     with playing(out, *words) as (page, process):

@@ -301,7 +301,6 @@ for package in (envs, experiments, ppl_jax):
 
 @pytest.mark.slow
 def test_a_run_on_mjx(tmp_path):
-    pytest.importorskip("mujoco.mjx")
     words = ["--physics", "mjx", "--total-steps", "20", "--batch-size", "16", "--hidden", "16"]
     ppl("train", "table_wiping", *words, "--out", tmp_path / "a")
     assert json.loads((tmp_path / "a" / "config.json").read_text())["settings"]["physics"] == "mjx"

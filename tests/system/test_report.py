@@ -310,11 +310,6 @@ def test_unknown_columns_and_kinds_are_refused(tmp_path):
             lambda path: film.render("scripted", 1000, path / "x.mp4", 1),
             r"ppl render to .mp4 needs av: pip install 'ppl-jax\[render\]'",
         ),
-        (
-            "mujoco",
-            lambda path: film.render("scripted", 1000, path / "x.gif", 1, env_name="table_wiping"),
-            r"needs mujoco: pip install 'ppl-jax\[manipulation\]'",
-        ),
     ],
 )
 def test_a_missing_package_is_one_line(module, call, told, tmp_path, monkeypatch):

@@ -65,7 +65,7 @@ def test_doctor_lists_every_extra_and_how_to_install_it(monkeypatch, capsys):
     lines = capsys.readouterr().out.partition("\nExtras\n")[2].splitlines()
     found = {line.split()[0]: line for line in lines}
     assert list(found) == [
-        *("render", "plot", "manipulation", "brax", "ray", "ui", "minari", "docs", "dev"),
+        *("render", "plot", "brax", "ray", "ui", "minari", "docs", "dev"),
         "chromium",
     ]
     for name, line in found.items():
@@ -86,13 +86,11 @@ def test_a_piece_that_is_there_is_ready():
     assert doctor.Piece("x", "reading JSON", ("json",)).line().endswith("reading JSON: ready")
 
 
-def test_the_bench_measures_an_arm_and_its_twin():
+def test_the_bench_measures_an_arm():
     figures = bench.arm_figures("table_wiping", 1, batches=(1,))
     assert figures.keys() == {
         "table_wiping_compile_s_1",
         "table_wiping_steps_per_s_1",
         "table_wiping_lookahead_10_ms",
-        "table_wiping_c_mujoco_steps_per_s",
-        "table_wiping_over_c_mujoco",
     }
     assert all(value > 0 for value in figures.values())

@@ -651,9 +651,7 @@ def test_an_environment_without_a_drawing_is_one_line():
 
 
 def test_a_missing_package_is_one_line_with_the_command(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(UserError) as refusal:
         views.display_of("table_wiping")
-    assert str(refusal.value) == (
-        "showing table_wiping needs mujoco: pip install 'ppl-jax[manipulation]'"
-    )
+    assert str(refusal.value) == ("showing table_wiping needs PIL: pip install 'ppl-jax[ui]'")

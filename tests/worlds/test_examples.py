@@ -58,7 +58,6 @@ def follow(folder):
 
 @pytest.mark.timeout(600)  # compiles a step of MJX, which takes two minutes of a free core
 def test_the_page_about_a_scene_of_ones_own_works_line_by_line(tmp_path):
-    pytest.importorskip("mujoco")
     code, commands = follow(tmp_path)
     assert run(tmp_path, "-c", code).split() == ["12", "6"]
     evaluate = commands[0].split()
@@ -70,7 +69,6 @@ def test_the_page_about_a_scene_of_ones_own_works_line_by_line(tmp_path):
 
 @pytest.mark.slow  # compiles for minutes
 def test_the_scene_of_the_page_trains_and_is_drawn(tmp_path):
-    pytest.importorskip("mujoco")
     _, (_, train, render) = follow(tmp_path)
     run(tmp_path, *train.split(), *SHORT)
     run(tmp_path, *render.split(), "--steps", "4")

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 import envs
 from envs.check import check_env
 from envs.manipulation.make import make_lift

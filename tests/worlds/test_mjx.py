@@ -12,8 +12,6 @@ from envs.manipulation.physics.mjx import newton, rows
 from envs.manipulation.physics.mjx.repairs import mjx, private
 from envs.manipulation.physics.mjx.scene import Scene
 
-pytest.importorskip("mujoco.mjx")
-
 BOX = """
 <mujoco><option timestep="0.002" cone="{cone}" impratio="{ratio}"/>
 <worldbody><geom name="floor" type="plane" size="1 1 .1" friction="{friction} .005 .0001"/>

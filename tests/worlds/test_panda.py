@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 from envs.manipulation.control.on_mjx import OperationalSpace
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.physics.mujoco_c import import_mujoco

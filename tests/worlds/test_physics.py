@@ -14,8 +14,6 @@ from envs.manipulation.make import make_nut_assembly, make_table_wiping
 from envs.manipulation.randomisation import Ranges
 from envs.manipulation.scenes.model import WIPING_BASE, WIPING_TABLE
 
-pytest.importorskip("mujoco.mjx")
-
 KEY = jax.random.key(0)
 MAKE = {"table_wiping": make_table_wiping, "nut_assembly": make_nut_assembly}
 ENGINES = ("analytic", "mjx", "mujoco_c")

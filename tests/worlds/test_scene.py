@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 from envs.check import check_env
 from envs.manipulation.control.on_mjx import OperationalSpace
 from envs.manipulation.physics.mjx.scene import Scene

@@ -39,9 +39,7 @@ def mjx() -> Any:
             module = importlib.import_module("mujoco.mjx")
             math = importlib.import_module("mujoco.mjx._src.math")
     except ImportError as error:
-        raise ImportError(
-            "physics 'mjx' needs mujoco-mjx: pip install ppl-jax[manipulation]"
-        ) from error
+        raise ImportError("physics 'mjx' needs mujoco-mjx: pip install mujoco-mjx") from error
     product = math.quat_mul
 
     @functools.wraps(product)
