@@ -40,7 +40,7 @@ from envs.manipulation.scenes.model import GRIPPER, NUT_BASE, TIMESTEP, WIPER, W
 from envs.manipulation.tasks import nut, wiping
 
 FREE_STEPS, WINDOW = 20, 10
-_LONGEST = 250  # steps that a compiled replay holds; longer recordings are replayed in parts
+_LANES, _PART = 32, 5  # windows side by side, and steps, of the one program that replays
 _KEY = jax.random.key(0)
 
 
@@ -123,33 +123,35 @@ def nut_state(record: Any, row: Any, prefix: str = "") -> nut.NutState:
     )
 
 
-def _replay(env: Any, state: Any, actions: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-    """States, rewards and observations after each action; the episode's end is ignored."""
+@functools.partial(jax.jit, static_argnums=0)
+def _replay(env: Any, states: Any, actions: jax.Array) -> tuple[Any, tuple[Any, Any, Any]]:
+    """Last states, and states, rewards and observations after each action; ends are ignored."""
 
     def step(state: Any, action: jax.Array) -> Any:
         state, outcome = env.transition(_KEY, state, action, env.default_params)
         return state, (state, outcome.reward, env.observe(state, env.default_params))
 
-    return jax.lax.scan(step, state, actions)[1]
+    return jax.vmap(lambda state, mine: jax.lax.scan(step, state, mine))(states, actions)
 
 
-_replay_one = jax.jit(_replay, static_argnums=0)
-_replay_many = jax.jit(
-    lambda env, states, actions: jax.vmap(lambda s, a: _replay(env, s, a))(states, actions),
-    static_argnums=0,
-)
+def _windows(env: Any, states: list[Any], actions: Any) -> Any:
+    """States, rewards and observations of windows of one length, [W, T] each.
 
-
-def _windows(env: Any, states: list[Any], actions: list[np.ndarray]) -> Any:
-    """Replay windows of one length, 32 at a time so that every folder shares a program."""
+    `_LANES` windows side by side and `_PART` steps at a time, so that all share a program.
+    """
     results, done = [], None
-    for first in range(0, len(states), 32):
-        some, acts = states[first : first + 32], actions[first : first + 32]
-        missing = 32 - len(some)
-        stacked = jax.tree.map(lambda *x: jnp.stack(x), *some, *[some[-1]] * missing)
-        done = _replay_many(env, stacked, jnp.float32([*acts, *[acts[-1]] * missing]))
-        kept = len(some)
-        results.append([np.asarray(x)[:kept] for x in jax.tree.leaves(done)])
+    for first in range(0, len(states), _LANES):
+        some, acts = states[first : first + _LANES], actions[first : first + _LANES]
+        missing = _LANES - len(some)
+        now = jax.tree.map(lambda *x: jnp.stack(x), *some, *[some[-1]] * missing)
+        acts = np.asarray([*acts, *[acts[-1]] * missing], np.float32)
+        steps = acts.shape[1]
+        acts = np.pad(acts, ((0, 0), (0, -steps % _PART), (0, 0)))
+        parts = []
+        for at in range(0, acts.shape[1], _PART):
+            now, done = _replay(env, now, acts[:, at : at + _PART])
+            parts.append([np.asarray(x)[: len(some)] for x in jax.tree.leaves(done)])
+        results.append([np.concatenate(x, 1)[:, :steps] for x in zip(*parts, strict=True)])
     leaves = [np.concatenate(parts) for parts in zip(*results, strict=True)]
     return jax.tree.unflatten(jax.tree.structure(done), leaves)
 
@@ -244,10 +246,11 @@ def _press(folder: Path, on: Worlds) -> float | None:
     if not found:
         return None
     record, errors = found[0], []
-    for run in range(len(record["action"])):
-        state = wiping_state(record, (run, 0))
-        after = _replay_one(on.wiping, state, jnp.float32(record["action"][run]))[0]
-        push = np.asarray(_push_up(after))[-10:].mean()
+    states = [wiping_state(record, (run, 0)) for run in range(len(record["action"]))]
+    after = _windows(on.wiping, states, record["action"])[0]
+    for run in range(len(states)):
+        mine = jax.tree.map(lambda x, run=run: jnp.asarray(x[run, -10:]), after)
+        push = np.asarray(_push_up(mine)).mean()
         wanted = record["contact_force"][run, -10:, 2].mean()
         errors.append(abs(push - wanted) / wanted)
     return float(max(errors))
@@ -266,14 +269,19 @@ def _observations(folder: Path, on: Worlds) -> float | None:
 
 
 def _wipe_rewards(folder: Path, on: Worlds) -> float | None:
-    agree = []
-    for record in _load(folder, "wipe_*.npz"):
-        steps = len(record["action"])
-        actions = np.zeros((max(_LONGEST, steps), 6), np.float32)
-        actions[:steps] = record["action"]
-        rewards = np.asarray(_replay_one(on.wiping, wiping_state(record, 0), actions)[1])[:steps]
-        agree.append(np.abs(rewards - record["reward"]) < 0.02)
-    return float(np.concatenate(agree).mean()) if agree else None
+    records = _load(folder, "wipe_*.npz")
+    if not records:
+        return None
+    longest = max(len(record["action"]) for record in records)
+    actions = np.zeros((len(records), longest, 6), np.float32)
+    for mine, record in zip(actions, records, strict=True):
+        mine[: len(record["action"])] = record["action"]
+    rewards = _windows(on.wiping, [wiping_state(record, 0) for record in records], actions)[1]
+    agree = [
+        np.abs(mine[: len(record["reward"])] - record["reward"]) < 0.02
+        for mine, record in zip(rewards, records, strict=True)
+    ]
+    return float(np.concatenate(agree).mean())
 
 
 def _nut_windows(folder: Path, on: Worlds) -> tuple[float | None, float | None]:
