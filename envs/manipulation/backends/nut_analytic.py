@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,14 +38,11 @@ class NutAnalytic:
             action: [7] in [-1, 1].
             factors: Of the scenario on the nominal world.
         """
-        if factors is NOMINAL:
-            step = _nominal
-            arguments = (state, action)
-        else:
-            step, arguments = _advance, (state, action, factors)
+        step: Any = _nominal if factors is NOMINAL else _advance
+        given = (state, action) if factors is NOMINAL else (state, action, factors)
         if jax.default_backend() == "cpu":
-            return jax.custom_batching.sequential_vmap(step)(*arguments)
-        return step(*arguments)
+            step = jax.custom_batching.sequential_vmap(step)
+        return step(*given)
 
 
 def _nominal(state: NutState, action: jax.Array) -> NutState:

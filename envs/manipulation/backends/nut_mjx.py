@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -63,7 +64,7 @@ class NutMjx:
         motion = jnp.concatenate([last[8:11], turn.T @ last[11:]])
         warm = warm.at[self.arm.dofs].set(last[:6]).at[self.ring_dofs].set(motion)
         warm = warm.at[self.gripper.dofs].set(last[6:8])
-        return self.scene.start(qpos).replace(qvel=qvel, warm=warm)
+        return dataclasses.replace(self.scene.start(qpos), qvel=qvel, warm=warm)
 
     def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:
         """The state after one control step of 0.05 s; see `NutAnalytic.advance`."""
@@ -97,7 +98,8 @@ class NutMjx:
         ring, motion = bodies.qpos[self.ring_at], bodies.qvel[self.ring_dofs]
         turn, last = rotation_matrix(ring[3:]), bodies.warm[self.ring_dofs]
         joints, speeds = self.gripper.joints(bodies, fingers)
-        return before.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return dataclasses.replace(
+            before,
             joints=bodies.qpos[self.arm.qpos],
             speeds=bodies.qvel[self.arm.dofs],
             acceleration=jnp.concatenate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -61,7 +62,9 @@ class WipingMjx:
         """The arm after one control step of 0.05 s; see `WipingAnalytic.advance`."""
         scene, arm = self.scene, self.arm
         put = scene.varied(factors, [self.wiper])
-        bodies = scene.start(state.joints).replace(qvel=state.speeds, warm=state.acceleration)
+        bodies = dataclasses.replace(
+            scene.start(state.joints), qvel=state.speeds, warm=state.acceleration
+        )
         goal = arm.goal(scene.placed(bodies, put), action, state.goal_rotation.T)
 
         def control(data: Any) -> Any:

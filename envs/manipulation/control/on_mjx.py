@@ -9,7 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.control.operational_space import applied_torque, arm_torque, shifted
+from envs.manipulation.control.operational_space import (
+    applied_torque,
+    arm_torque,
+    axes_of,
+    shifted,
+    vector_of,
+)
 from envs.manipulation.physics.analytic.arm import drag
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.randomisation import NOMINAL, Factors
@@ -114,9 +120,7 @@ class OperationalSpace:
         )
         if self.tool is not None:
             twist = speed @ jacobian
-            axes = data.site_xmat[self.site].T
-            force, torque = drag(
-                self.tool, tuple(map(tuple, axes)), (tuple(twist[:3]), tuple(twist[3:]))
-            )
+            axes = axes_of(data.site_xmat[self.site])
+            force, torque = drag(self.tool, axes, (vector_of(twist[:3]), vector_of(twist[3:])))
             total = total + jacobian @ jnp.stack([*force, *torque])
         return total

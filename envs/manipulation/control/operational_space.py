@@ -168,6 +168,18 @@ def nullspace_torque(
     ]
 
 
+def vector_of(values: jax.Array) -> Vector:
+    """[3] as scalars."""
+    x, y, z = values
+    return x, y, z
+
+
+def axes_of(rotation: jax.Array) -> Matrix:
+    """Columns of a rotation [3, 3] as scalars."""
+    x, y, z = rotation.T
+    return vector_of(x), vector_of(y), vector_of(z)
+
+
 def arm_torque(
     jacobian: jax.Array,
     mass: jax.Array,
@@ -198,9 +210,9 @@ def arm_torque(
     torque = task_torque(
         columns,
         factor,
-        site=(tuple(position), tuple(tuple(axis) for axis in rotation.T)),
-        twist=(tuple(twist[:3]), tuple(twist[3:])),
-        goal=(tuple(goal[0]), tuple(tuple(axis) for axis in goal[1].T)),
+        site=(vector_of(position), axes_of(rotation)),
+        twist=(vector_of(twist[:3]), vector_of(twist[3:])),
+        goal=(vector_of(goal[0]), axes_of(goal[1])),
         gain=gain,
     )
     if count > 6:
@@ -240,9 +252,7 @@ def shifted(
     position: jax.Array, rotation: jax.Array, action: jax.Array, held: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """`new_goal` on arrays: position [3] m and rotation [3, 3] (columns)."""
-    place, turn = new_goal(
-        list(action), tuple(position), tuple(map(tuple, rotation.T)), tuple(map(tuple, held.T))
-    )
+    place, turn = new_goal(list(action), vector_of(position), axes_of(rotation), axes_of(held))
     return jnp.stack(place), unrolled_linalg.array(turn).T
 
 

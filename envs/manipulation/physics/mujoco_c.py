@@ -73,12 +73,15 @@ MayClose = Callable[[Any, Any, Any], Any]
 """`may_close(model, data, contact) -> [C]` of truth values, for MuJoCo's and for MJX's alike."""
 
 
+Leaf = Any  # an array of a program or of the host, or its shape
+
+
 class MujocoState(NamedTuple):
     """What the next physics step depends on: [nq], [nv], [nv] (the last acceleration)."""
 
-    qpos: jax.Array
-    qvel: jax.Array
-    warm: jax.Array
+    qpos: Leaf
+    qvel: Leaf
+    warm: Leaf
 
 
 class Measured(NamedTuple):
@@ -89,11 +92,11 @@ class Measured(NamedTuple):
         position, rotation: [3] m and [3, 3] (columns) of the site.
     """
 
-    jacobian: jax.Array
-    mass: jax.Array
-    bias: jax.Array
-    position: jax.Array
-    rotation: jax.Array
+    jacobian: Leaf
+    mass: Leaf
+    bias: Leaf
+    position: Leaf
+    rotation: Leaf
 
 
 class Touched(NamedTuple):
@@ -104,9 +107,9 @@ class Touched(NamedTuple):
         closed: [G] whether any is closed.
     """
 
-    force: jax.Array
-    normal: jax.Array
-    closed: jax.Array
+    force: Leaf
+    normal: Leaf
+    closed: Leaf
 
 
 class MujocoC:
@@ -173,7 +176,7 @@ class MujocoC:
                         found[a, b], found[b, a] = (group, 1), (group, -1)
         return found
 
-    def _place(self, state: tuple[np.ndarray, ...], factors: np.ndarray, places: Any) -> None:
+    def _place(self, state: Sequence[np.ndarray], factors: np.ndarray, places: Any) -> None:
         model, data, nominal = self.model, self.data, self._nominal
         data.qpos[:], data.qvel[:] = state[0], state[1]
         data.qacc_warmstart[:] = state[2]

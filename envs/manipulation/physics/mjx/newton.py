@@ -70,8 +70,8 @@ class Solution(NamedTuple):
     """Acceleration [nv], forces of the rows [R], and of the cones [3, C] (x, y, z)."""
 
     acceleration: jax.Array
-    rows: jax.Array | None
-    cones: jax.Array | None
+    rows: Any
+    cones: Any
 
 
 def solve_spd(matrix: jax.Array, right: jax.Array) -> jax.Array:
@@ -137,7 +137,7 @@ class _Search(NamedTuple):
         origin, move, length: It is origin + length * move: [nv], [nv], a share.
         steepness: Slope downwards along `move` at `origin`, J/s^2.
         energy: Of the last step of Newton's method.
-        count: Evaluations so far.
+        turns: Evaluations so far.
     """
 
     a: jax.Array
@@ -146,7 +146,7 @@ class _Search(NamedTuple):
     steepness: jax.Array
     length: jax.Array
     energy: jax.Array
-    count: jax.Array
+    turns: jax.Array
 
 
 def _row_force(rows: Rows, residual: jax.Array) -> jax.Array:
@@ -179,7 +179,9 @@ def solve(
         rows, cones: Constraints, or None.
         iterations: Largest number of evaluations.
     """
-    size = free.shape[0]
+    size, missing = free.shape[0], 0
+    by_dof: Any = None
+    by_contact: Any = None
     if cones is not None:
         # by degree of freedom to find accelerations of contacts, by contact to sum over them
         by_dof = cones.jacobian
@@ -228,11 +230,11 @@ def solve(
             steepness=jnp.where(beyond, carry.steepness, energy),
             length=length,
             energy=jnp.where(beyond, jnp.inf, energy),
-            count=carry.count + 1,
+            turns=carry.turns + 1,
         )
 
     def unsettled(carry: _Search) -> jax.Array:
-        return (carry.energy > CONVERGED) & (carry.count < iterations)
+        return (carry.energy > CONVERGED) & (carry.turns < iterations)
 
     acting = jnp.zeros((), bool)
     if cones is not None:
@@ -247,7 +249,7 @@ def solve(
         steepness=jnp.zeros(()),
         length=jnp.ones(()),
         energy=jnp.where(acting, jnp.inf, 0.0),
-        count=jnp.zeros((), jnp.int32),
+        turns=jnp.zeros((), jnp.int32),
     )
     a = jax.lax.while_loop(unsettled, improve, begin).a
     own = None if rows is None else _row_force(rows, rows.jacobian @ a - rows.reference)

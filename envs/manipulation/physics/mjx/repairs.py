@@ -37,7 +37,7 @@ def mjx() -> Any:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             module = importlib.import_module("mujoco.mjx")
-            math = importlib.import_module("mujoco.mjx._src.math")
+            math: Any = importlib.import_module("mujoco.mjx._src.math")
     except ImportError as error:
         raise ImportError("physics 'mjx' needs mujoco-mjx: pip install mujoco-mjx") from error
     product = math.quat_mul

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -406,7 +407,8 @@ class Scene:
     @staticmethod
     def kept(bodies: Bodies, data: Any) -> Bodies:
         """The state after a physics step."""
-        return bodies.replace(
+        return dataclasses.replace(
+            bodies,
             qpos=data.qpos,
             qvel=data.qvel,
             warm=data.qacc_warmstart,
