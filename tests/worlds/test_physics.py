@@ -127,6 +127,7 @@ def test_the_table_ends_alike():
         np.testing.assert_allclose(after["analytic"].force, after[physics].force, atol=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["table_wiping", "nut_assembly"])
 def test_worlds_side_by_side_are_worlds_alone(name):
     states, actions, _ = played(name, "analytic")
@@ -141,6 +142,7 @@ def test_worlds_side_by_side_are_worlds_alone(name):
         np.testing.assert_allclose(many.speeds[index], one.speeds, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_256_nut_worlds_finish():
     """A large batch never waits for itself: LAPACK under `vmap` did, with few threads."""
     code = """
@@ -163,7 +165,7 @@ print("done")
     assert done.stdout.strip().endswith("done"), done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("physics", ["analytic", "mjx"])
+@pytest.mark.parametrize("physics", ["analytic", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_randomisation_is_traced_and_nominal_at_zero(physics):
     env = world("table_wiping", physics)
     states, actions, _ = played("table_wiping", "analytic")
