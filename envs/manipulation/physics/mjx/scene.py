@@ -74,8 +74,8 @@ class Scene:
         Args:
             model: MJCF as text, a path, an `MjSpec`, or a compiled `MjModel`.
             control_step: Of the controller, s; a multiple of the model's timestep.
-            solver: "newton", "mjx", or None for "newton" where it can solve the scene (all but
-                elliptic cones with torsion or rolling, and uneven friction).
+            solver: "newton", "mjx", or None for "newton" where it can solve the scene: elliptic
+                cones without torsion, rolling or uneven friction.
             keep: Names of geoms that touch nothing, but whose places are asked for.
             may_close: Which contacts a step may close; all where None.
 
@@ -105,8 +105,8 @@ class Scene:
         self.solver = solver or ("newton" if able else "mjx")
         if self.solver == "newton" and not able:
             raise ValueError(
-                "solver 'newton' cannot solve elliptic contacts of condim 4 or 6, nor uneven "
-                "friction: choose 'mjx'"
+                "solver 'newton' cannot solve pyramidal cones, contacts of condim 4 or 6, nor "
+                "uneven friction: choose 'mjx'"
             )
         pyramids = self.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         dims = np.asarray(contact.dim, int)
