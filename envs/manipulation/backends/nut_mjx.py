@@ -10,17 +10,14 @@ import jax.numpy as jnp
 
 from envs.manipulation.backends.wiping_mjx import without_air
 from envs.manipulation.control.gripper_on_mjx import Fingers, TwoFingerGripper
-from envs.manipulation.control.on_mjx import OperationalSpace
+from envs.manipulation.control.on_mjx import ur5e
 from envs.manipulation.physics.analytic.quaternion import rotation_matrix
 from envs.manipulation.physics.may_close import on_long_sides
 from envs.manipulation.physics.mjx.scene import Bodies, Scene
 from envs.manipulation.physics.mujoco_c import nut_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
-    ARM_JOINTS,
-    FRICTION_LOSS,
     GRIPPER,
-    TORQUE_LIMIT,
 )
 from envs.manipulation.tasks.nut import NutState
 
@@ -38,14 +35,7 @@ class NutMjx:
             solver: Of contacts; see `Scene`.
         """
         scene = self.scene = Scene(without_air(nut_xml()), solver=solver, may_close=on_long_sides)
-        self.arm = OperationalSpace(
-            scene,
-            joints=ARM_JOINTS,
-            site="grip",
-            torque_limit=TORQUE_LIMIT,
-            friction=FRICTION_LOSS,
-            tool=GRIPPER,
-        )
+        self.arm = ur5e(scene, GRIPPER)
         self.gripper = TwoFingerGripper(scene, holds="handle")
         self.ring_at, self.ring_dofs = scene.free_joint("ring")
         self.ring = scene.body("ring")

@@ -8,15 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.manipulation.control.on_mjx import OperationalSpace
+from envs.manipulation.control.on_mjx import ur5e
 from envs.manipulation.physics.may_close import over_wiping_table
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.physics.mujoco_c import import_mujoco, wiping_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import (
-    ARM_JOINTS,
-    FRICTION_LOSS,
-    TORQUE_LIMIT,
     WIPER,
 )
 from envs.manipulation.tasks.wiping import Moved, WipingState
@@ -47,14 +44,7 @@ class WipingMjx:
         self.scene = Scene(
             without_air(wiping_xml(markers=0)), solver=solver, may_close=over_wiping_table
         )
-        self.arm = OperationalSpace(
-            self.scene,
-            joints=ARM_JOINTS,
-            site="grip",
-            torque_limit=TORQUE_LIMIT,
-            friction=FRICTION_LOSS,
-            tool=WIPER,
-        )
+        self.arm = ur5e(self.scene, WIPER)
         self.points = self.scene.contacts("table", "point_")
         self.wiper = self.scene.body("hand")
 

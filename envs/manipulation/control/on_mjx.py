@@ -19,7 +19,7 @@ from envs.manipulation.control.operational_space import (
 from envs.manipulation.physics.analytic.arm import drag
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.randomisation import NOMINAL, Factors
-from envs.manipulation.scenes.model import Tool
+from envs.manipulation.scenes.model import ARM_JOINTS, FRICTION_LOSS, TORQUE_LIMIT, Tool
 
 
 class Goal(NamedTuple):
@@ -124,3 +124,15 @@ class OperationalSpace:
             force, torque = drag(self.tool, axes, (vector_of(twist[:3]), vector_of(twist[3:])))
             total = total + jacobian @ jnp.stack([*force, *torque])
         return total
+
+
+def ur5e(scene: Scene, tool: Tool) -> OperationalSpace:
+    """The UR5e of `scenes.model` with a tool in its hand."""
+    return OperationalSpace(
+        scene,
+        joints=ARM_JOINTS,
+        site="grip",
+        torque_limit=TORQUE_LIMIT,
+        friction=FRICTION_LOSS,
+        tool=tool,
+    )

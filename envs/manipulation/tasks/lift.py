@@ -11,19 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation.control.gripper_on_mjx import TwoFingerGripper
-from envs.manipulation.control.on_mjx import OperationalSpace
+from envs.manipulation.control.on_mjx import ur5e
 from envs.manipulation.physics.analytic import grasp_contact, gripper
 from envs.manipulation.physics.may_close import over_table
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.physics.mujoco_c import grasp_softness
 from envs.manipulation.scenes.lift import CUBE_HALF, TABLE, lift_scene
 from envs.manipulation.scenes.model import (
-    ARM_JOINTS,
-    FRICTION_LOSS,
     GRIPPER,
     INITIAL_JOINTS,
     INITIAL_NOISE,
-    TORQUE_LIMIT,
 )
 from envs.manipulation.tasks.base import HELD_OUT_SCENARIOS, TRAINING_SCENARIOS
 from envs.manipulation.tasks.scene_task import SceneState, SceneTask, Start, Verdict
@@ -117,14 +114,7 @@ class Lift(SceneTask):
             solver: Of contacts; see `Scene`.
         """
         scene = Scene(lift_xml(), solver=solver, may_close=over_table(TABLE))
-        arm = OperationalSpace(
-            scene,
-            joints=ARM_JOINTS,
-            site="grip",
-            torque_limit=TORQUE_LIMIT,
-            friction=FRICTION_LOSS,
-            tool=GRIPPER,
-        )
+        arm = ur5e(scene, GRIPPER)
         self.cube, self.hand = scene.body("cube"), scene.body("hand")
         self.cube_at, _ = scene.free_joint("cube")
         super().__init__(

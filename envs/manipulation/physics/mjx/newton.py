@@ -31,7 +31,7 @@ _UNROLLED = 8  # degrees of freedom up to which a factor is unrolled
 _LANES = 8  # numbers that a CPU adds at once
 _TOGETHER = 2  # contacts in one turn of the loop over them
 
-TWO_SIDED, ONE_SIDED, DRY = 0, 1, 2  # kinds of a row: equality; limit or pyramid's edge; friction
+TWO_SIDED, ONE_SIDED, DRY = 0, 1, 2  # kinds of a row: equality; limit, bare contact; friction
 
 
 class Rows(NamedTuple):

@@ -82,10 +82,11 @@ def cones(scene: Any, put: Any, data: Any) -> Cones | None:
     if which is None:
         return None
     contact = jax.tree.map(lambda leaf: leaf[which], impl.contact) if scene.mixed else impl.contact
-    geoms = contact.geom if scene.pairs is None else scene.pairs[which]
-    first, second = (jnp.asarray(scene.model.geom_bodyid)[geoms[:, i]] for i in (0, 1))
-    if scene.pairs is not None:  # known before tracing
-        first, second = (scene.model.geom_bodyid[geoms[:, i]] for i in (0, 1))
+    if scene.pairs is None:
+        bodies = jnp.asarray(scene.model.geom_bodyid)[contact.geom]
+    else:  # known before tracing
+        bodies = scene.model.geom_bodyid[scene.pairs[which]]
+    first, second = bodies[:, 0], bodies[:, 1]
     sign = scene.moved_by[second] - scene.moved_by[first]  # [C, nv]
     # a degree of freedom moves a point p at v + w x p, w and v seen at the world's origin
     spin = data.cdof[:, :3]
@@ -116,7 +117,7 @@ def cones(scene: Any, put: Any, data: Any) -> Cones | None:
 
 
 def rows(scene: Any, put: Any, data: Any) -> Rows | None:
-    """Equalities, dry friction, limits, contacts without friction, and edges of pyramids."""
+    """Equalities, dry friction, limits, and contacts without friction."""
     if scene.row_kinds.size == 0:
         return None
     constraint = private("constraint")
@@ -134,14 +135,14 @@ def rows(scene: Any, put: Any, data: Any) -> Rows | None:
     )
 
 
-def kinds(put: Any, dims: np.ndarray, pyramids: bool) -> np.ndarray:
+def kinds(put: Any, dims: np.ndarray) -> np.ndarray:
     """Kind of each row of `rows`, [R], in MJX's order.
 
     Args:
         put: MJX's model.
-        dims: Of the contacts. pyramids: Whether their edges are rows too.
+        dims: Of the contacts.
     """
     constraint = private("constraint")
-    only = dims if pyramids else np.where(dims == 1, 1, 0)
+    only = np.where(dims == 1, 1, 0)
     equalities, dry, limits, contacts = constraint.counts(constraint.make_efc_type(put, only))
     return np.repeat([TWO_SIDED, DRY, ONE_SIDED], [equalities, dry, limits + contacts])

@@ -99,7 +99,7 @@ class Scene:
             self.put = mjx().put_model(self.model)
             self._blank = mjx().make_data(self.put)
         except (NotImplementedError, ValueError) as error:
-            raise ValueError(f"MJX cannot simulate this scene: {_one_line(error)}") from error
+            raise ValueError(f"MJX cannot simulate this scene: {source.one_line(error)}") from error
         contact = self._blank._impl.contact
         able = constraint_rows.elliptic_only(self.model)
         self.solver = solver or ("newton" if able else "mjx")
@@ -108,12 +108,11 @@ class Scene:
                 "solver 'newton' cannot solve pyramidal cones, contacts of condim 4 or 6, nor "
                 "uneven friction: choose 'mjx'"
             )
-        pyramids = self.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         dims = np.asarray(contact.dim, int)
         wide = np.flatnonzero(dims == 3)
-        self.cone_rows = wide if len(wide) and not pyramids else None
+        self.cone_rows = wide if len(wide) else None
         self.mixed = len(wide) != len(dims)
-        self.row_kinds = constraint_rows.kinds(self.put, dims, bool(pyramids))
+        self.row_kinds = constraint_rows.kinds(self.put, dims)
         self.moved_by = constraint_rows.moved_by(self.model)
         self.dof_root = self.model.body_rootid[self.model.dof_bodyid]
         self.ratio = float(self.model.opt.impratio)
@@ -445,8 +444,3 @@ class Scene:
         friction = contact.friction[rows]
         plane = [(edges[:, 2 * i] - edges[:, 2 * i + 1]) * friction[:, i] for i in (0, 1)]
         return jnp.stack([jnp.sum(edges, -1), *plane], -1)
-
-
-def _one_line(error: Exception) -> str:
-    parts = error.args if len(error.args) > 1 else (str(error),)
-    return " ".join(" ".join(str(part) for part in parts).split())

@@ -14,8 +14,10 @@ Source = Any
 """MJCF as text, the path of an MJCF file, a `mujoco.MjSpec`, or a compiled `mujoco.MjModel`."""
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def one_line(error: Exception) -> str:
+    """The message of MuJoCo's or MJX's error in one line."""
+    parts = error.args if len(error.args) > 1 else (str(error),)
+    return " ".join(" ".join(str(part) for part in parts).split())
 
 
 def read(source: Source) -> Any:
@@ -38,7 +40,7 @@ def read(source: Source) -> Any:
             raise ValueError(f"no MJCF file {text!r}")
         return mujoco.MjSpec.from_file(text)
     except ValueError as error:
-        raise ValueError(f"this MJCF does not parse: {_first_line(error)}") from error
+        raise ValueError(f"this MJCF does not parse: {one_line(error)}") from error
 
 
 def compiled(spec: Any) -> Any:
@@ -50,7 +52,7 @@ def compiled(spec: Any) -> Any:
     try:
         return spec.compile()
     except ValueError as error:
-        raise ValueError(f"this MJCF does not compile: {_first_line(error)}") from error
+        raise ValueError(f"this MJCF does not compile: {one_line(error)}") from error
 
 
 def without_looks(spec: Any, model: Any, keep: Iterable[str] = ()) -> Any:
