@@ -2,13 +2,15 @@
 
 import functools
 import time
+import types
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from envs.manipulation.physics.mjx import newton, rows
+from envs.manipulation.physics.mjx import closed_forms, newton, rows
 from envs.manipulation.physics.mjx.repairs import mjx, private
 from envs.manipulation.physics.mjx.scene import Scene
 
@@ -92,6 +94,76 @@ def test_the_repair_is_still_needed():
         f"MJX without the barrier behind quat_mul takes {ratio:.1f} times as long: the repair in "
         "envs/manipulation/physics/mjx/repairs.py is no longer needed, remove it"
     )
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")
+def test_a_step_scatters_nothing():
+    """One scatter keeps a step from being one function (`repairs.py`): three times the time."""
+    scene = boxes("elliptic", "newton")
+    step = jax.jit(lambda bodies: scene.step(scene.data(bodies), lambda data: data).qpos)
+    text = step.lower(moving(scene)).compile().as_text()
+    assert " scatter(" not in text
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")
+def test_the_repairs_against_scatters_are_still_needed():
+    """Says so when MJX no longer scatters where it is repaired, and that they change no number."""
+    math, scan = private("math"), private("scan")
+    axis, angle = jnp.array([0.6, 0.0, -0.8]), jnp.float32(0.7)
+    plain = math.axis_angle_to_quat.__wrapped__
+    values, segments = jnp.arange(8.0).reshape(4, 2), np.array([2, 0, 2, 2])
+    pairs = [
+        (plain, math.axis_angle_to_quat, (axis, angle)),
+        (
+            lambda x: jax.ops.segment_sum(x, segments, 4),
+            lambda x: scan.jax.ops.segment_sum(x, segments, 4),
+            (values,),
+        ),
+    ]
+    for original, repaired, given in pairs:
+        np.testing.assert_array_equal(jax.jit(original)(*given), jax.jit(repaired)(*given))
+        assert "scatter" in jax.jit(original).lower(*given).as_text(), (
+            "MJX scatters no longer here: the repair in "
+            "envs/manipulation/physics/mjx/repairs.py is no longer needed, remove it"
+        )
+        assert "scatter" not in jax.jit(repaired).lower(*given).as_text()
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "box"])
+def test_closed_forms_are_c_mujocos(shape):
+    """Random places, inside and outside; the same contact as C MuJoCo wherever it has one."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+<body pos="0 0 1"><freejoint/><geom type="{shape}" size=".05 .04 .06" margin=".05"/></body>
+<body><freejoint/><geom type="sphere" size=".02" margin=".05"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    form = jax.jit(functools.partial(contact_of, shape))
+    random = np.random.default_rng(0)
+    found = 0
+    for _ in range(300):
+        turn = random.normal(size=4)
+        data.qpos[3:7] = turn / np.linalg.norm(turn)
+        data.qpos[7:10] = data.qpos[:3] + random.uniform(-0.15, 0.15, 3)
+        mujoco.mj_forward(model, data)
+        where = [data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size]
+        distance, point, normal = form(*(x.astype(np.float32)[[1, 0]] for x in where))
+        if data.ncon:
+            contact, found = data.contact[0], found + 1
+            sign = 1 if contact.geom1 == 1 else -1  # from the sphere
+            assert distance == pytest.approx(contact.dist, abs=2e-6)
+            np.testing.assert_allclose(point, contact.pos, atol=3e-6)
+            np.testing.assert_allclose(normal, sign * contact.frame[:3], atol=2e-4)
+        else:
+            assert distance > 0.05
+    assert 150 < found < 290
+
+
+def contact_of(shape, position, rotation, size):
+    form = closed_forms.sphere_cylinder if shape == "cylinder" else closed_forms.sphere_box
+    one, other = (
+        types.SimpleNamespace(pos=p, mat=r, size=s)
+        for p, r, s in zip(position, rotation, size, strict=True)
+    )
+    return form(one, other)
 
 
 def test_a_step_calls_no_lapack():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from envs.manipulation.physics.analytic import gripper, unrolled_linalg
 from envs.manipulation.physics.analytic.arm import bias_torque, frames
 from envs.manipulation.physics.analytic.grasp_contact import Ring, hold
 from envs.manipulation.physics.analytic.quaternion import rotation_matrix, turned
+from envs.manipulation.physics.lanes import one_after_another
 from envs.manipulation.randomisation import NOMINAL, Factors
 from envs.manipulation.scenes.model import GRIPPER, NUT_BASE, SUBSTEPS, TIMESTEP
 from envs.manipulation.tasks.nut import NutState
@@ -30,23 +30,12 @@ class NutAnalytic:
     def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:
         """The state after one control step of 0.05 s, contact flag included.
 
-        On a CPU a batch goes one world after another: the contact solver is as fast with one as
-        with many, and then stops in each world as soon as it has converged.
-
         Args:
             state: State.
             action: [7] in [-1, 1].
             factors: Of the scenario on the nominal world.
         """
-        step: Any = _nominal if factors is NOMINAL else _advance
-        given = (state, action) if factors is NOMINAL else (state, action, factors)
-        if jax.default_backend() == "cpu":
-            step = jax.custom_batching.sequential_vmap(step)
-        return step(*given)
-
-
-def _nominal(state: NutState, action: jax.Array) -> NutState:
-    return _advance(state, action, NOMINAL)
+        return one_after_another(_advance, state, action, factors)
 
 
 def _advance(state: NutState, action: jax.Array, factors: Factors) -> NutState:

@@ -12,7 +12,9 @@ from envs.manipulation.backends.wiping_mjx import without_air
 from envs.manipulation.control.gripper_on_mjx import Fingers, TwoFingerGripper
 from envs.manipulation.control.on_mjx import ur5e
 from envs.manipulation.physics.analytic.quaternion import rotation_matrix
+from envs.manipulation.physics.lanes import one_after_another
 from envs.manipulation.physics.may_close import on_long_sides
+from envs.manipulation.physics.mjx.places import with_values
 from envs.manipulation.physics.mjx.scene import Bodies, Scene
 from envs.manipulation.physics.mujoco_c import nut_xml
 from envs.manipulation.randomisation import NOMINAL, Factors
@@ -26,7 +28,7 @@ class NutMjx:
     """25 steps of 2 ms: arm, fingers and ring with their contacts."""
 
     name = "mjx"
-    sequential_on_cpu = False
+    sequential_on_cpu = True
 
     def __init__(self, solver: str | None = None):
         """Compile the scene.
@@ -58,13 +60,16 @@ class NutMjx:
 
     def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:
         """The state after one control step of 0.05 s; see `NutAnalytic.advance`."""
+        return one_after_another(self._advance, state, action, factors)
+
+    def _advance(self, state: NutState, action: jax.Array, factors: Factors) -> NutState:
         scene, arm = self.scene, self.arm
         put, bodies = scene.varied(factors, [self.ring]), self.bodies(state)
         goal = arm.goal(scene.placed(bodies, put), action, state.goal_rotation.T)
 
         def torque(data: Any) -> jax.Array:
             own = arm.torque(data, goal, factors)
-            return jnp.zeros_like(data.qvel).at[arm.dofs].set(own)
+            return with_values(jnp.zeros_like(data.qvel), arm.dofs, own)
 
         def step(carry: tuple[Bodies, Fingers], _: None) -> tuple[tuple[Bodies, Fingers], None]:
             moved = self.gripper.step(*carry, action=action[6], torque=torque, put=put)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.manipulation.control.on_mjx import ur5e
+from envs.manipulation.physics.lanes import one_after_another
 from envs.manipulation.physics.may_close import over_wiping_table
 from envs.manipulation.physics.mjx.scene import Scene
 from envs.manipulation.physics.mujoco_c import import_mujoco, wiping_xml
@@ -33,7 +34,7 @@ class WipingMjx:
     """25 steps of 2 ms with the exact set of 56 contact points."""
 
     name = "mjx"
-    sequential_on_cpu = False
+    sequential_on_cpu = True
 
     def __init__(self, solver: str | None = None):
         """Compile the scene.
@@ -50,6 +51,9 @@ class WipingMjx:
 
     def advance(self, state: WipingState, action: jax.Array, factors: Factors = NOMINAL) -> Moved:
         """The arm after one control step of 0.05 s; see `WipingAnalytic.advance`."""
+        return one_after_another(self._advance, state, action, factors)
+
+    def _advance(self, state: WipingState, action: jax.Array, factors: Factors) -> Moved:
         scene, arm = self.scene, self.arm
         put = scene.varied(factors, [self.wiper])
         bodies = dataclasses.replace(

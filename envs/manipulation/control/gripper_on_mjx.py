@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation.physics.analytic import gripper
+from envs.manipulation.physics.mjx.places import with_values
 from envs.manipulation.physics.mjx.scene import Bodies, Scene
 
 KNUCKLES = tuple(f"{side}_knuckle" for side in gripper.SIDES)
@@ -80,7 +81,7 @@ class TwoFingerGripper:
     def posed(self, put: Any, bodies: Bodies, fingers: Fingers) -> Any:
         """MJX's model with the spheres where the fingers have them."""
         place = gripper.pad_spheres(bodies.qpos[self.at], fingers.inner)
-        return put.replace(geom_pos=put.geom_pos.at[self.spheres].set(place))
+        return put.replace(geom_pos=with_values(put.geom_pos, self.spheres, place))
 
     def torque(self, data: Any, command: jax.Array) -> jax.Array:
         """Torque of the knuckles' servos, [2] N m."""
@@ -119,7 +120,7 @@ class TwoFingerGripper:
         command = jnp.clip(fingers.command + gripper.RAMP * jnp.sign(action), -1.0, 1.0)
 
         def control(data: Any) -> Any:
-            applied = torque(data).at[self.dofs].set(self.torque(data, command))
+            applied = with_values(torque(data), self.dofs, self.torque(data, command))
             return data.replace(qfrc_applied=applied)
 
         data = self.scene.step(self.scene.data(bodies), control, self.posed(put, bodies, fingers))

@@ -17,6 +17,8 @@ import numpy as np
 
 from envs.manipulation.control.gripper_on_mjx import TwoFingerGripper
 from envs.manipulation.control.on_mjx import Goal, OperationalSpace
+from envs.manipulation.physics.lanes import one_after_another
+from envs.manipulation.physics.mjx.places import with_values
 from envs.manipulation.physics.mjx.scene import Bodies, Scene
 from envs.manipulation.randomisation import Factors, Ranges
 from envs.manipulation.tasks.base import HELD_OUT_SCENARIOS, TRAINING_SCENARIOS, ArmTask
@@ -157,7 +159,7 @@ class SceneTask(ArmTask):
             for numbers in (training, held_out)
         ]
         super().__init__(*pools, experts=experts or {})
-        self.sequential_on_cpu = False
+        self.sequential_on_cpu = True
         self.scene, self.arm = scene, arm
         self.gripper: Any = gripper
         self._handled = [scene.body(name) for name in handled]
@@ -254,7 +256,7 @@ class SceneTask(ArmTask):
         """One control step, without reset."""
         del key  # the world is deterministic
         action = jnp.clip(action, -1.0, 1.0)
-        moved = self._moved(state, action, self.factors(state, params))
+        moved = one_after_another(self._moved, state, action, self.factors(state, params))
         diverged = ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in _floats(moved)]))
         new = jax.tree.map(lambda old, new: jnp.where(diverged, old, new), state, moved)
         new = dataclasses.replace(new, time=state.time + 1)
@@ -322,7 +324,7 @@ class SceneTask(ArmTask):
 
             def torque(data: Any) -> jax.Array:
                 own = arm.torque(data, aimed(data, goal, first), factors)
-                return jnp.zeros_like(data.qvel).at[arm.dofs].set(own)
+                return with_values(jnp.zeros_like(data.qvel), arm.dofs, own)
 
             if gripper is None:
                 data = scene.step(

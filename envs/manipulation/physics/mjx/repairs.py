@@ -1,7 +1,7 @@
 """The only door to MJX: `mjx()` imports it, with what it needs to run well on a CPU.
 
-Two repairs. Neither changes a number (`tests/worlds/test_mjx.py` holds them against MJX as it is),
-and both do nothing but on a CPU.
+Three repairs. None changes a number (`tests/worlds/test_mjx.py` holds them against MJX as it is),
+and all do nothing but on a CPU.
 
 1. **A barrier behind `math.quat_mul`.** `mjx.kinematics` walks the tree with a product of
    quaternions per joint. XLA's CPU compiler fuses the walk, so that every joint computes all of its
@@ -10,6 +10,13 @@ and both do nothing but on a CPU.
 2. **No LAPACK.** MJX factors the mass matrix and the solver's Hessian by `cho_factor`, a LAPACK
    call per world, which waits for itself where a large batch meets few threads. `Scene` steps with
    `newton.py` and `unrolled_linalg.py` instead and never calls it (but see `Scene`'s `solver`).
+3. **No scatter.** XLA's CPU compiler makes one function of a loop that moves little data
+   (`envs.compiler`), but not of one with a scatter: each of a step's 400 operations is then a task
+   of its own, and dealing them out takes two thirds of the time. MJX scatters where it inserts one
+   number into a quaternion, and where it sums over the children of a body.
+
+Beside these, `closed_forms.py` takes the place of two of MJX's searches; it agrees with C MuJoCo to
+rounding and serves all backends.
 
 Without warp-lang, importing MJX prints two lines to the standard output; they are swallowed.
 """
@@ -20,10 +27,16 @@ import contextlib
 import functools
 import importlib
 import io
+import types
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.manipulation.physics.mjx import closed_forms
 
 
 @functools.cache
@@ -40,16 +53,64 @@ def mjx() -> Any:
             math: Any = importlib.import_module("mujoco.mjx._src.math")
     except ImportError as error:
         raise ImportError("physics 'mjx' needs mujoco-mjx: pip install mujoco-mjx") from error
-    product = math.quat_mul
-
-    @functools.wraps(product)
-    def barred(u: jax.Array, v: jax.Array) -> jax.Array:
-        if jax.default_backend() != "cpu":
-            return product(u, v)
-        return jax.lax.optimization_barrier(product(u, v))
-
-    math.quat_mul = barred
+    scan: Any = importlib.import_module("mujoco.mjx._src.scan")
+    math.quat_mul = _on_cpu(math.quat_mul, _barred(math.quat_mul))
+    math.axis_angle_to_quat = _on_cpu(math.axis_angle_to_quat, _quaternion)
+    scan.jax = _JaxOfScan("jax")
+    _close_forms(math)
     return module
+
+
+def _close_forms(math: Any) -> None:
+    """Let MJX collide spheres with cylinders and boxes by `closed_forms.py`."""
+    driver: Any = importlib.import_module("mujoco.mjx._src.collision_driver")
+    primitive: Any = importlib.import_module("mujoco.mjx._src.collision_primitive")
+    sphere, kinds = driver.GeomType.SPHERE, driver.GeomType
+
+    def collider(contact: Callable[..., Any]) -> Callable[..., Any]:
+        def framed(first: Any, second: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+            distance, point, normal = contact(first, second)
+            return distance, point, math.make_frame(normal)
+
+        return primitive.collider(ncon=1)(framed)
+
+    driver._COLLISION_FUNC[sphere, kinds.CYLINDER] = collider(closed_forms.sphere_cylinder)
+    driver._COLLISION_FUNC[sphere, kinds.BOX] = collider(closed_forms.sphere_box)
+
+
+def _on_cpu(original: Callable[..., Any], repaired: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def either(*args: Any) -> Any:
+        return (repaired if jax.default_backend() == "cpu" else original)(*args)
+
+    return either
+
+
+def _barred(product: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    return lambda u, v: jax.lax.optimization_barrier(product(u, v))
+
+
+def _quaternion(axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """`math.axis_angle_to_quat` without `jnp.insert`."""
+    s, c = jnp.sin(angle * 0.5), jnp.cos(angle * 0.5)
+    return jnp.concatenate([c[None], axis * s])
+
+
+def _segment_sum(values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
+    """`jax.ops.segment_sum` whose segments are known before tracing."""
+    sums = [jnp.zeros(values.shape[1:], values.dtype)] * count
+    for row, segment in enumerate(segments):
+        sums[segment] = sums[segment] + values[row]
+    return jnp.stack(sums)
+
+
+class _JaxOfScan(types.ModuleType):
+    """JAX as `mjx._src.scan` sees it: with another `ops.segment_sum`."""
+
+    ops = types.SimpleNamespace(segment_sum=_on_cpu(jax.ops.segment_sum, _segment_sum))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(jax, name)
 
 
 def private(module: str) -> Any:
