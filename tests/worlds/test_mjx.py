@@ -96,13 +96,52 @@ def test_the_repair_is_still_needed():
     )
 
 
+FINGERS = """
+<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
+<body><joint name="a" axis="0 0 1" range="-1 .1" limited="true"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
+<body pos=".3 0 0"><joint name="b" axis="0 1 0" range="-.2 .5" limited="true" margin=".01"/>
+<geom type="sphere" size=".03"/></body>
+<body pos=".3 .1 0"><joint name="c" type="slide" axis="1 0 0" range="-.01 .02" limited="true"/>
+<geom type="sphere" size=".03"/></body></body></worldbody>
+<actuator><motor joint="a" gear="3"/><position joint="c" kp="40"/></actuator></mujoco>"""
+
+
+@functools.cache
+def fingers():
+    return Scene(FINGERS)
+
+
+def bent(scene):
+    """Two joints beyond their limits, one within."""
+    start = scene.start(qpos=[0.15, 0.0, -0.013], ctrl=[0.5, 0.01])
+    return start.replace(qvel=jnp.array([0.3, -0.2, 0.1]))
+
+
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")
-def test_a_step_scatters_nothing():
+@pytest.mark.parametrize(
+    ("scene", "start"), [(lambda: boxes("elliptic", "newton"), moving), (fingers, bent)]
+)
+def test_a_step_scatters_nothing(scene, start):
     """One scatter keeps a step from being one function (`repairs.py`): three times the time."""
-    scene = boxes("elliptic", "newton")
+    scene = scene()
     step = jax.jit(lambda bodies: scene.step(scene.data(bodies), lambda data: data).qpos)
-    text = step.lower(moving(scene)).compile().as_text()
-    assert " scatter(" not in text
+    assert " scatter(" not in step.lower(start(scene)).compile().as_text()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")
+def test_limits_and_motors_are_mjxs():
+    scene, constraint = fingers(), private("constraint")
+    data = scene.placed(bent(scene))
+    for repaired in (constraint._efc_limit_slide_hinge, mjx().transmission):
+        original = repaired.__wrapped__
+        ours, theirs = jax.tree.leaves(repaired(scene.put, data)), original(scene.put, data)
+        for own, other in zip(ours, jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_array_equal(own, other)
+        assert "scatter" in jax.jit(original).lower(scene.put, data).as_text(), (
+            "MJX scatters no longer here: the repair in "
+            "envs/manipulation/physics/mjx/repairs.py is no longer needed, remove it"
+        )
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the repair acts on a CPU alone")

@@ -13,7 +13,8 @@ and all do nothing but on a CPU.
 3. **No scatter.** XLA's CPU compiler makes one function of a loop that moves little data
    (`envs.compiler`), but not of one with a scatter: each of a step's 400 operations is then a task
    of its own, and dealing them out takes two thirds of the time. MJX scatters where it inserts one
-   number into a quaternion, and where it sums over the children of a body.
+   number into a quaternion, sums over the children of a body, and places a joint's limit or motor
+   among the degrees of freedom. (Left as they are: equalities, ball joints' limits and tendons.)
 
 Beside these, `closed_forms.py` takes the place of two of MJX's searches; it agrees with C MuJoCo to
 rounding and serves all backends.
@@ -37,6 +38,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.manipulation.physics.mjx import closed_forms
+from envs.manipulation.physics.mujoco_c import import_mujoco
+
+_SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
+_JOINT_TRANSMISSIONS = (0, 1)  # mjtTrn: JOINT, JOINTINPARENT
 
 
 @functools.cache
@@ -54,9 +59,14 @@ def mjx() -> Any:
     except ImportError as error:
         raise ImportError("physics 'mjx' needs mujoco-mjx: pip install mujoco-mjx") from error
     scan: Any = importlib.import_module("mujoco.mjx._src.scan")
+    constraint: Any = importlib.import_module("mujoco.mjx._src.constraint")
     math.quat_mul = _on_cpu(math.quat_mul, _barred(math.quat_mul))
     math.axis_angle_to_quat = _on_cpu(math.axis_angle_to_quat, _quaternion)
     scan.jax = _JaxOfScan("jax")
+    constraint._efc_limit_slide_hinge = _on_cpu(
+        constraint._efc_limit_slide_hinge, _limits(constraint._Efc)
+    )
+    module.transmission = _on_cpu(module.transmission, _motors(module.transmission))
     _close_forms(math)
     return module
 
@@ -102,6 +112,54 @@ def _segment_sum(values: jax.Array, segments: np.ndarray, count: int) -> jax.Arr
     for row, segment in enumerate(segments):
         sums[segment] = sums[segment] + values[row]
     return jnp.stack(sums)
+
+
+def _limits(row: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    """`constraint._efc_limit_slide_hinge`, all limits at once."""
+
+    def rows(m: Any, d: Any) -> Any:
+        limited = np.isin(m.jnt_type, (_SLIDE, _HINGE)) & (np.asarray(m.jnt_limited) != 0)
+        which = np.flatnonzero(limited)
+        if m.opt.disableflags & import_mujoco().mjtDisableBit.mjDSBL_LIMIT or not which.size:
+            return None
+        place, dof = d.qpos[m.jnt_qposadr[which]], m.jnt_dofadr[which]
+        margin = m.jnt_margin[which]
+        below, above = place - m.jnt_range[which, 0], m.jnt_range[which, 1] - place
+        position = jnp.minimum(below, above) - margin
+        acts = position < 0
+        side = jnp.where(below < above, 1.0, -1.0) * acts
+        return row(
+            side[:, None] * np.eye(m.nv, dtype=np.float32)[dof],
+            position * acts,
+            position,
+            m.dof_invweight0[dof],
+            m.jnt_solref[which],
+            m.jnt_solimp[which],
+            margin,
+            jnp.zeros_like(position),
+        )
+
+    return rows
+
+
+def _motors(original: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """`smooth.transmission`, all at once where every actuator turns a hinge or moves a slide."""
+
+    def transmission(m: Any, d: Any) -> Any:
+        joints = np.asarray(m.actuator_trnid)[:, 0] if m.nu else np.zeros(0, int)
+        on_joints = np.all(np.isin(m.actuator_trntype, _JOINT_TRANSMISSIONS))
+        if not (m.nu and on_joints and np.all(np.isin(m.jnt_type[joints], (_SLIDE, _HINGE)))):
+            return original(m, d)
+        gear = m.actuator_gear[:, 0]
+        moment = gear[:, None] * np.eye(m.nv, dtype=np.float32)[m.jnt_dofadr[joints]]
+        return d.tree_replace(
+            {
+                "actuator_length": d.qpos[m.jnt_qposadr[joints]] * gear,
+                "_impl.actuator_moment": moment,
+            }
+        )
+
+    return transmission
 
 
 class _JaxOfScan(types.ModuleType):
