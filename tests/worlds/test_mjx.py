@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from envs.manipulation.physics.lanes import one_after_another
 from envs.manipulation.physics.mjx import closed_forms, newton, rows
 from envs.manipulation.physics.mjx.repairs import mjx, private
 from envs.manipulation.physics.mjx.scene import Scene
+from envs.manipulation.randomisation import NOMINAL
 
 BOX = """
 <mujoco><option timestep="0.002" cone="{cone}" impratio="{ratio}"/>
@@ -279,3 +281,38 @@ def test_solving_without_lapack(size):
         rtol=1e-4,
         atol=1e-5,
     )
+
+
+def primitives(jaxpr, found):
+    """Names of all primitives, and of scans with their lengths."""
+    for equation in jaxpr.eqns:
+        name = equation.primitive.name
+        found.add(f"scan {equation.params['length']}" if name == "scan" else name)
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                primitives(inner, found)
+    return found
+
+
+def test_on_an_accelerator_a_batch_is_one_program(monkeypatch):
+    """On a CPU seven worlds go one after another; elsewhere none does, and nothing calls back."""
+    scene = fingers()
+
+    def advance(bodies, action, factors):
+        put = scene.varied(factors)
+        control = lambda data: data.replace(qfrc_applied=action)  # noqa: E731
+        return scene.advance(bodies, control, lambda data: data.qacc, put)[0]
+
+    def used():
+        def step(action):
+            return one_after_another(advance, bent(scene), action, NOMINAL)
+
+        return primitives(jax.make_jaxpr(jax.vmap(step))(jnp.zeros((7, 3))).jaxpr, set())
+
+    assert {"scan 7", "scan 25"} <= used()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    elsewhere = used()
+    assert "scan 25" in elsewhere
+    assert "scan 7" not in elsewhere
+    assert not [name for name in elsewhere if "callback" in name]
