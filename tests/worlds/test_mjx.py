@@ -316,3 +316,39 @@ def test_on_an_accelerator_a_batch_is_one_program(monkeypatch):
     assert "scan 25" in elsewhere
     assert "scan 7" not in elsewhere
     assert not [name for name in elsewhere if "callback" in name]
+
+
+def test_warp_is_mjx():
+    """MuJoCo Warp on its CPU device, where warp-lang is installed: one control step, two worlds."""
+    pytest.importorskip("warp", reason="MuJoCo Warp (the extra `warp`) is not installed")
+    ends = []
+    for impl in ("jax", "warp"):
+        scene = Scene(FINGERS, impl=impl)
+
+        def advance(torque, scene=scene):
+            bodies, mass = scene.advance(
+                bent(scene), lambda data: data.replace(qfrc_applied=torque), scene.mass_matrix
+            )
+            return bodies.qpos, bodies.qvel, mass
+
+        ends.append(jax.jit(jax.vmap(advance))(jnp.array([[0.0, 0.1, 0.0], [0.2, 0.0, -0.1]])))
+    for ours, theirs in zip(*ends, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"impl": "cuda"}, "impl must be one of jax, warp, got 'cuda'"),
+        ({"impl": "warp", "solver": "newton"}, "impl 'warp' has its own solver"),
+    ],
+)
+def test_an_impl_that_cannot_be_is_one_line(options, error):
+    with pytest.raises(ValueError, match=error):
+        Scene(FINGERS, **options)
+
+
+def test_warp_that_is_not_installed_is_one_line(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="impl 'warp' needs MuJoCo Warp: pip install"):
+        Scene(FINGERS, impl="warp")

@@ -218,7 +218,7 @@ class SceneTask(ArmTask):
     @property
     def physics(self) -> str:
         """Name of the engine."""
-        return "mjx"
+        return "mjx" if self.scene.impl == "jax" else f"mjx-{self.scene.impl}"
 
     def reset_to(self, index: jax.Array, key: jax.Array, params: SceneParams) -> SceneState:
         """The start of scenario `index` of the pool, at rest."""

@@ -54,7 +54,7 @@ def mjx() -> Any:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            module = importlib.import_module("mujoco.mjx")
+            module: Any = importlib.import_module("mujoco.mjx")
             math: Any = importlib.import_module("mujoco.mjx._src.math")
     except ImportError as error:
         raise ImportError("physics 'mjx' needs mujoco-mjx: pip install mujoco-mjx") from error

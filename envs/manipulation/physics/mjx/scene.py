@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.manipulation.physics.mjx import newton, source
+from envs.manipulation.physics.mjx import newton, source, warp
 from envs.manipulation.physics.mjx import rows as constraint_rows
 from envs.manipulation.physics.mjx.repairs import mjx, private
 from envs.manipulation.physics.mujoco_c import MayClose, import_mujoco
@@ -19,6 +19,7 @@ from envs.manipulation.randomisation import NOMINAL, Factors
 
 CONTROL_STEP = 0.05  # s
 SOLVERS = ("newton", "mjx")
+IMPLS = ("jax", "warp")
 
 Control = Callable[[Any], Any]
 """`control(data) -> data` with `qfrc_applied` or `ctrl` set. It is called in every physics step,
@@ -56,8 +57,9 @@ class Scene:
         full: C MuJoCo's model with all that is drawn. Places in `qpos` and `qvel` are the same.
         put: MJX's model.
         timestep: Of physics, s. substeps: Physics steps per control step.
-        solver: Of contacts: "newton" (`newton.py`) or "mjx" (MJX's own).
-        pairs: [C, 2] geoms of each contact of MJX's; None where a broad phase picks them.
+        impl: Of MJX: "jax", or "warp" (MuJoCo Warp).
+        solver: Of contacts: "newton" (`newton.py`), "mjx" (MJX's own) or "warp" (Warp's own).
+        pairs: [C, 2] geoms of each contact of MJX's; None where they have no fixed places.
     """
 
     def __init__(
@@ -68,6 +70,8 @@ class Scene:
         solver: str | None = None,
         keep: Iterable[str] = (),
         may_close: MayClose | None = None,
+        impl: str = "jax",
+        room: warp.Room = warp.Room(),  # noqa: B008
     ):
         """Parse, compile and check a scene.
 
@@ -78,14 +82,19 @@ class Scene:
                 cones without torsion, rolling or uneven friction.
             keep: Names of geoms that touch nothing, but whose places are asked for.
             may_close: Which contacts a step may close; all where None.
+            impl: "jax", or "warp" where MuJoCo Warp is installed and there is a CUDA device (it
+                also runs, slowly, on a CPU). Contacts then have no fixed rows: what reads their
+                forces (`contacts`, `TwoFingerGripper`) needs "jax".
+            room: For contacts and constraints with "warp".
 
         Raises:
             ValueError: One line, if the MJCF does not parse, the timestep does not divide the
                 control step, MJX cannot collide two of its shapes or lacks another feature, or
                 `solver` is none.
-            ImportError: Without MuJoCo XLA.
+            ImportError: Without MuJoCo XLA, or with "warp" without Warp.
         """
         mujoco = import_mujoco()
+        self.impl = impl
         if isinstance(model, mujoco.MjModel):
             self.full = self.model = model
         else:
@@ -96,6 +105,10 @@ class Scene:
         self._check(control_step, solver)
         self.substeps = round(control_step / self.timestep)
         try:
+            if impl == "warp":
+                self.put, self._blank = warp.put(self.model, room)
+                self.solver, self.pairs = "warp", None
+                return
             self.put = mjx().put_model(self.model)
             self._blank = mjx().make_data(self.put)
         except (NotImplementedError, ValueError) as error:
@@ -131,6 +144,11 @@ class Scene:
             )
         if solver is not None and solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
+        if self.impl not in IMPLS:
+            raise ValueError(f"impl must be one of {', '.join(IMPLS)}, got {self.impl!r}")
+        if self.impl == "warp" and (solver is not None or self._may_close is not None):
+            raise ValueError("impl 'warp' has its own solver and contacts: solver and may_close "
+                             "must be None")  # fmt: skip
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise ValueError("integrator must be Euler, implicit or implicitfast, got RK4")
 
@@ -203,8 +221,8 @@ class Scene:
             ValueError: If the two never meet, or a broad phase picks the contacts.
         """
         if self.pairs is None:
-            raise ValueError("contacts have no fixed rows where max_geom_pairs or "
-                             "max_contact_points is set")  # fmt: skip
+            raise ValueError("contacts have no fixed rows with impl 'warp', nor where "
+                             "max_geom_pairs or max_contact_points is set")  # fmt: skip
         names = [self.model.geom(i).name for i in range(self.model.ngeom)]
         found = [
             row
@@ -258,9 +276,13 @@ class Scene:
     def placed(self, bodies: Bodies, put: Any = None) -> Any:
         """MJX's data with the frames of bodies, geoms and sites, and the joints' axes."""
         put = self.put if put is None else put
+        if self.impl == "warp":
+            return mjx().forward(put, self.data(bodies))
         return mjx().com_pos(put, mjx().kinematics(put, self.data(bodies)))
 
     def _collided(self, put: Any, data: Any) -> Any:
+        if self.impl == "warp":
+            return data  # `placed` did it
         data = mjx().collision(put, data)
         if self._may_close is not None:
             contact = data._impl.contact
@@ -299,6 +321,8 @@ class Scene:
             put: Another MJX model of the same shapes, with other masses, frictions or places.
         """
         put, x = self.put if put is None else put, mjx()
+        if self.impl == "warp":  # its stages have no names of their own: forward is computed twice
+            return x.step(put, control(x.forward(put, data)))
         data = x.com_pos(put, x.kinematics(put, data))
         if self.model.ntendon:
             data = private("smooth").tendon(put, data)
@@ -374,6 +398,8 @@ class Scene:
 
     def mass_matrix(self, data: Any) -> jax.Array:
         """Joint-space inertia of a step's start, [nv, nv]."""
+        if self.impl == "warp":
+            return warp.mass_matrix(self.model, data)
         return mjx().full_m(self.put, data)
 
     def advance(
