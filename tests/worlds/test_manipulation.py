@@ -36,6 +36,14 @@ def transition(name):
 
 
 @functools.cache
+def four_together(name):
+    env = world(name)
+    return jax.jit(
+        jax.vmap(lambda state, action: env.transition(KEY, state, action, env.default_params))
+    )
+
+
+@functools.cache
 def expert_action(name):
     env = world(name)
     return jax.jit(lambda state: env.scripted_expert(KEY, state, None, env.default_params))
@@ -95,38 +103,6 @@ def test_arm_is_c_mujocos(mujoco, name):
         np.testing.assert_allclose(bias, data.qfrc_bias[:6], atol=2e-4)
 
 
-def test_arm_and_pressed_wiper_are_mjxs(mujoco):
-    """MJX defines the physics: mass, bias and the acceleration under contact agree with it."""
-    mjx = pytest.importorskip("mujoco.mjx")
-    from envs.manipulation.physics.mujoco_c import wiping_xml
-
-    model = mujoco.MjModel.from_xml_string(wiping_xml(markers=0))
-    record = pressed_state()
-    data = mujoco.MjData(model)
-    torque = np.array([1.0, -20.0, 12.0, 3.0, -2.0, 0.5])
-    data.qpos[:], data.qvel[:], data.qfrc_applied[:] = record[0], record[1], torque
-    put = mjx.put_model(model)
-    seen = jax.jit(mjx.forward)(put, mjx.put_data(model, data))
-    _, _, _columns, mass, bias = arm_values(record[0], record[1], WIPER)
-    np.testing.assert_allclose(mass, np.asarray(mjx.full_m(put, seen)), atol=1e-4)
-    np.testing.assert_allclose(bias, np.asarray(seen.qfrc_bias), atol=1e-3)
-    passive = np.asarray(seen.qfrc_passive)
-    free = np.linalg.solve(mass, torque + passive - bias)
-    at = arm.frames([jnp.float32(x) for x in record[0]], WIPER)
-    joints = [jnp.float32(x) for x in record[1]]
-    motion = operational_space.Motion(
-        at,
-        arm.jacobian(at),
-        operational_space.twist_of(arm.jacobian(at), joints),
-        [[jnp.float32(x) for x in row] for row in mass],
-        [jnp.float32(x) for x in free],
-        joints,
-    )
-    touch = wipe_contact.press(motion, jnp.asarray(free, jnp.float32))
-    assert float(touch.force[2]) > 5.0
-    np.testing.assert_allclose(touch.acceleration, seen.qacc, atol=0.02, rtol=0.02)
-
-
 def pressed_state():
     """Joints and speeds of a wiper that slides, pressed a millimetre into the table."""
     state = start("table_wiping")
@@ -146,10 +122,7 @@ def test_vmap_equals_loop(name):
     env = world(name)
     states = [start(name, index) for index in range(4)]
     actions = jax.random.uniform(KEY, (4, env.spec.action_size), minval=-1.0)
-    many = jax.jit(
-        jax.vmap(lambda state, action: env.transition(KEY, state, action, env.default_params))
-    )
-    together = many(jax.tree.map(lambda *x: jnp.stack(x), *states), actions)
+    together = four_together(name)(jax.tree.map(lambda *x: jnp.stack(x), *states), actions)
     for index, (state, action) in enumerate(zip(states, actions, strict=True)):
         alone = transition(name)(state, action)
         close(jax.tree.map(lambda x, i=index: x[i], together), alone, 2e-3)
@@ -187,14 +160,12 @@ def test_lookahead_is_the_world_and_leaves_no_trace(name):
 @pytest.mark.parametrize("name", WORLDS)
 def test_broken_physics_ends_one_world_and_spreads_nowhere(name):
     env = world(name)
-    states = jax.tree.map(lambda *x: jnp.stack(x), start(name, 0), start(name, 1))
+    states = jax.tree.map(lambda *x: jnp.stack(x), *(start(name, index) for index in range(4)))
     states = states.replace(speeds=states.speeds.at[0, 0].set(jnp.nan))
-    actions = jnp.zeros((2, env.spec.action_size))
-    after, outcome = jax.jit(jax.vmap(lambda s, a: env.transition(KEY, s, a, env.default_params)))(
-        states, actions
-    )
-    assert list(np.asarray(outcome.physics_diverged)) == [True, False]
-    assert list(np.asarray(outcome.terminated)) == [True, False]
+    actions = jnp.zeros((4, env.spec.action_size))
+    after, outcome = four_together(name)(states, actions)
+    assert list(np.asarray(outcome.physics_diverged)) == [True, False, False, False]
+    assert list(np.asarray(outcome.terminated)) == [True, False, False, False]
     assert not bool(outcome.success[0])
     assert np.isfinite(np.asarray(outcome.reward)).all()
     alone, _ = transition(name)(start(name, 1), actions[1])

@@ -32,23 +32,22 @@ def stepper(name, physics):
 
 
 @functools.cache
-def player(name, physics):
-    env = world(name, physics)
-
-    def step(state, _):
-        action = env.scripted_expert(KEY, state, None, env.default_params)
-        after, outcome = env.transition(KEY, state, action, env.default_params)
-        return after, (state, action, outcome)
-
-    return jax.jit(lambda state: jax.lax.scan(step, state, None, length=EPISODE))
+def expert(name):
+    env = world(name, "analytic")
+    return jax.jit(lambda state: env.scripted_expert(KEY, state, None, env.default_params))
 
 
 @functools.cache
 def played(name, physics):
     """States, actions and outcomes of the expert's episode from the first start."""
-    env = world(name, physics)
-    start = env.reset_to(jnp.int32(0), KEY, env.default_params)
-    return jax.device_get(player(name, physics)(start)[1])
+    env, seen = world(name, physics), []
+    state = env.reset_to(jnp.int32(0), KEY, env.default_params)
+    for _ in range(EPISODE):
+        action = expert(name)(state)
+        after, outcome = stepper(name, physics)(state, action)
+        seen.append(jax.device_get((state, action, outcome)))
+        state = after
+    return jax.tree.map(lambda *steps: np.stack(steps), *seen)
 
 
 @pytest.mark.parametrize("physics", ["mjx", "mujoco_c"])
