@@ -51,7 +51,7 @@ def bench_physics(
     Args:
         names: Environments.
         repeats: Timed calls of each program; the fastest counts.
-        batches: Numbers of worlds side by side; those of `vmap` but for 1.
+        batches: Numbers of worlds side by side, of `vmap` but for 1; the first alone for C MuJoCo.
         out: CSV file, written row by row, or None.
     """
     rows: list[dict[str, Any]] = []
@@ -59,7 +59,8 @@ def bench_physics(
         state = _in_contact(name)
         for physics in card(name).physics:
             env = make(name, physics=physics)
-            for batch in batches:
+            # C MuJoCo is called one world after another: a batch is the same figure, and minutes
+            for batch in batches[:1] if physics == "mujoco_c" else batches:
                 rows.append(
                     {"env": name, "physics": physics, "batch": batch}
                     | _figures(env, state, batch, repeats)

@@ -6,8 +6,8 @@
 elliptic cones scatter every contact into one dense matrix, its line search is a loop within the
 loop and its factors are LAPACK's: three quarters of a step on a CPU. Here
 
-- the Hessian is summed contact by contact in rows of eight, which a CPU adds at once, where a
-  product of two small matrices in a loop is one number at a time (seven times slower);
+- the Hessian is summed over the contacts in eights, which a CPU adds at once, where a product of
+  two small matrices in a loop is one number at a time (seven times slower);
 - no line search looks ahead: each iteration evaluates the cost's slope where the last one went,
   and goes back along the same line where that was too far;
 - a matrix of more than eight rows is eliminated in a loop: unrolled, its code takes ten times
@@ -29,7 +29,6 @@ CONVERGED = 1e-4  # energy of a step to stop at, J/s^2
 TOO_FAR = 0.3  # slope behind a step, as a share of that before it, from which it is shortened
 _UNROLLED = 8  # degrees of freedom up to which a factor is unrolled
 _LANES = 8  # numbers that a CPU adds at once
-_TOGETHER = 2  # contacts in one turn of the loop over them
 
 TWO_SIDED, ONE_SIDED, DRY = 0, 1, 2  # kinds of a row: equality; limit, bare contact; friction
 
@@ -96,37 +95,32 @@ def _in_lanes(rows: jax.Array) -> jax.Array:
     return jnp.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, missing)])
 
 
-def _summed(jacobian: jax.Array, bend: jax.Array, force: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """sum_c J_c' H_c J_c, [nv, nv], and sum_c J_c' f_c, [nv].
+def _curvature(jacobian: Any, bend: jax.Array) -> jax.Array:
+    """sum_c J_c' H_c J_c, [nv, nv], of contacts in whole lanes.
 
     Args:
-        jacobian: [C, 3, n] with n >= nv in whole lanes, and C a multiple of `_TOGETHER`.
-        bend: [C, 6] H's xx, xy, yy, xz, yz, zz.
-        force: [C, 3].
+        jacobian: [nv, 3, C], C a multiple of `_LANES`.
+        bend: [6, C] H's xx, xy, yy, xz, yz, zz.
     """
-    lanes = jacobian.shape[-1]
-
-    def add(turn: Any, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        matrix, pull = sums
-        for one in range(_TOGETHER):
-            x, y, z, h, f = (
-                *jax.lax.dynamic_index_in_dim(jacobian, turn * _TOGETHER + one, 0, False),
-                jax.lax.dynamic_index_in_dim(bend, turn * _TOGETHER + one, 0, False),
-                jax.lax.dynamic_index_in_dim(force, turn * _TOGETHER + one, 0, False),
-            )
-            matrix = matrix + x[:, None] * (h[0] * x + h[1] * y + h[3] * z)
-            matrix = matrix + y[:, None] * (h[1] * x + h[2] * y + h[4] * z)
-            matrix = matrix + z[:, None] * (h[3] * x + h[4] * y + h[5] * z)
-            pull = pull + f[0] * x + f[1] * y + f[2] * z
-        return matrix, pull
-
-    zeros = (jnp.zeros((lanes, lanes)), jnp.zeros(lanes))
-    return jax.lax.fori_loop(0, jacobian.shape[0] // _TOGETHER, add, zeros)
+    (x, y, z), h = (jacobian[:, axis] for axis in range(3)), bend
+    bent = (h[0] * x + h[1] * y + h[3] * z, h[1] * x + h[2] * y + h[4] * z)
+    bent = jax.lax.optimization_barrier((*bent, h[3] * x + h[4] * y + h[5] * z))  # [nv, C] each
+    total: Any = 0.0
+    for first in range(0, jacobian.shape[-1], _LANES):
+        lanes = slice(first, first + _LANES)
+        for own, other in zip((x, y, z), bent, strict=True):
+            total = total + own[:, None, lanes] * other[None, :, lanes]
+    return jnp.sum(jax.lax.optimization_barrier(total), -1)
 
 
-def _with_rows(values: jax.Array, count: int) -> jax.Array:
-    """`count` rows of zeros more."""
-    return jnp.pad(values, [(0, count)] + [(0, 0)] * (values.ndim - 1)) if count else values
+def _pull(jacobian: Any, force: jax.Array) -> jax.Array:
+    """sum_c J_c' f_c, [nv], of contacts in whole lanes; force is [3, C]."""
+    total: Any = 0.0
+    for first in range(0, jacobian.shape[-1], _LANES):
+        lanes = slice(first, first + _LANES)
+        for axis in range(3):
+            total = total + jacobian[:, axis, lanes] * force[axis, lanes]
+    return jnp.sum(jax.lax.optimization_barrier(total), -1)
 
 
 class _Search(NamedTuple):
@@ -179,20 +173,12 @@ def solve(
         rows, cones: Constraints, or None.
         iterations: Largest number of evaluations.
     """
-    size, missing = free.shape[0], 0
-    by_dof: Any = None
-    by_contact: Any = None
-    if cones is not None:
-        # by degree of freedom to find accelerations of contacts, by contact to sum over them
-        by_dof = cones.jacobian
-        missing = -cones.weight.shape[0] % _TOGETHER
-        by_contact = _in_lanes(jnp.transpose(by_dof, (2, 1, 0)))
-        by_contact = jax.lax.optimization_barrier(_with_rows(by_contact, missing))
+    in_lanes = None if cones is None else _in_lanes(cones.jacobian)
 
     def slip(a: jax.Array) -> jax.Array:
         assert cones is not None
-        total = by_dof[0] * a[0] - cones.reference
-        for column, value in zip(by_dof[1:], a[1:], strict=True):
+        total = cones.jacobian[0] * a[0] - cones.reference
+        for column, value in zip(cones.jacobian[1:], a[1:], strict=True):
             total = total + column * value
         return total
 
@@ -204,10 +190,8 @@ def solve(
             force, bend = jax.lax.optimization_barrier(
                 cone(at, cones.weight, cones.friction, cones.ratio)
             )
-            curved, pull = _summed(
-                by_contact, _with_rows(bend.T, missing), _with_rows(force.T, missing)
-            )
-            down, matrix = down + pull[:size], matrix + curved[:size, :size]
+            down = down + _pull(in_lanes, _in_lanes(force))
+            matrix = matrix + _curvature(in_lanes, _in_lanes(bend))
         if rows is not None:
             r = rows.jacobian @ a - rows.reference
             down = down + rows.jacobian.T @ _row_force(rows, r)
