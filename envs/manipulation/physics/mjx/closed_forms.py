@@ -2,7 +2,7 @@
 
 MJX searches for the first by gradient descent on distance fields (its source says that an
 analytic version is still to be written), and goes through the faces and edges of a box as if it
-were any mesh: two thirds of a step of the nut. C MuJoCo has closed forms (`mjc_SphereCylinder`,
+were any mesh: two fifths of a step of the nut. C MuJoCo has closed forms (`mjc_SphereCylinder`,
 `mjc_SphereBox` of `engine_collision_primitive.c` and `engine_collision_box.c`), which these are;
 `tests/worlds/test_mjx.py` holds them against it.
 """
