@@ -12,9 +12,9 @@ and all do nothing but on a CPU.
    `newton.py` and `unrolled_linalg.py` instead and never calls it (but see `Scene`'s `solver`).
 3. **No scatter.** XLA's CPU compiler makes one function of a loop that moves little data
    (`envs.compiler`), but not of one with a scatter: each of a step's 400 operations is then a task
-   of its own, and dealing them out takes more than half of the time. MJX scatters where it inserts one
-   number into a quaternion, sums over the children of a body, and places a joint's limit or motor
-   among the degrees of freedom. (Left as they are: equalities, ball joints' limits and tendons.)
+   of its own, and dealing them out takes more than half of the time. MJX scatters where it inserts
+   one number into a quaternion, sums over the children of a body, and places a joint's limit or
+   motor among the degrees of freedom. (Left as they are: equalities, ball joints' limits, tendons.)
 
 Beside these, `closed_forms.py` takes the place of two of MJX's searches; it agrees with C MuJoCo to
 rounding and serves all backends.
