@@ -103,6 +103,38 @@ def test_arm_is_c_mujocos(mujoco, name):
         np.testing.assert_allclose(bias, data.qfrc_bias[:6], atol=2e-4)
 
 
+def test_arm_and_pressed_wiper_are_mjxs(mujoco):
+    """MJX defines the physics: mass, bias and the acceleration under contact agree with it."""
+    mjx = pytest.importorskip("mujoco.mjx")
+    from envs.manipulation.physics.mujoco_c import wiping_xml
+
+    model = mujoco.MjModel.from_xml_string(wiping_xml(markers=0))
+    record = pressed_state()
+    data = mujoco.MjData(model)
+    torque = np.array([1.0, -20.0, 12.0, 3.0, -2.0, 0.5])
+    data.qpos[:], data.qvel[:], data.qfrc_applied[:] = record[0], record[1], torque
+    put = mjx.put_model(model)
+    seen = jax.jit(mjx.forward)(put, mjx.put_data(model, data))
+    _, _, _columns, mass, bias = arm_values(record[0], record[1], WIPER)
+    np.testing.assert_allclose(mass, np.asarray(mjx.full_m(put, seen)), atol=1e-4)
+    np.testing.assert_allclose(bias, np.asarray(seen.qfrc_bias), atol=1e-3)
+    passive = np.asarray(seen.qfrc_passive)
+    free = np.linalg.solve(mass, torque + passive - bias)
+    at = arm.frames([jnp.float32(x) for x in record[0]], WIPER)
+    joints = [jnp.float32(x) for x in record[1]]
+    motion = operational_space.Motion(
+        at,
+        arm.jacobian(at),
+        operational_space.twist_of(arm.jacobian(at), joints),
+        [[jnp.float32(x) for x in row] for row in mass],
+        [jnp.float32(x) for x in free],
+        joints,
+    )
+    touch = wipe_contact.press(motion, jnp.asarray(free, jnp.float32))
+    assert float(touch.force[2]) > 5.0
+    np.testing.assert_allclose(touch.acceleration, seen.qacc, atol=0.02, rtol=0.02)
+
+
 def pressed_state():
     """Joints and speeds of a wiper that slides, pressed a millimetre into the table."""
     state = start("table_wiping")
