@@ -25,7 +25,6 @@ class NutAnalytic:
     """25 steps of 2 ms: arm, fingers and ring with their contacts as one convex problem."""
 
     name = "analytic"
-    sequential_on_cpu = True
 
     def advance(self, state: NutState, action: jax.Array, factors: Factors = NOMINAL) -> NutState:
         """The state after one control step of 0.05 s, contact flag included.

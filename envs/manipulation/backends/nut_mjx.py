@@ -28,7 +28,6 @@ class NutMjx:
     """25 steps of 2 ms: arm, fingers and ring with their contacts."""
 
     name = "mjx"
-    sequential_on_cpu = True
 
     def __init__(self, solver: str | None = None):
         """Compile the scene.

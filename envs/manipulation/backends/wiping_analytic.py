@@ -20,7 +20,6 @@ class WipingAnalytic:
     """25 steps of 2 ms: the arm in closed form, the wiper's 56 points by Newton's method."""
 
     name = "analytic"
-    sequential_on_cpu = True
 
     def advance(self, state: WipingState, action: jax.Array, factors: Factors = NOMINAL) -> Moved:
         """The arm after one control step of 0.05 s.

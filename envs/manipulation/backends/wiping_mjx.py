@@ -34,7 +34,6 @@ class WipingMjx:
     """25 steps of 2 ms with the exact set of 56 contact points."""
 
     name = "mjx"
-    sequential_on_cpu = True
 
     def __init__(self, solver: str | None = None):
         """Compile the scene.

@@ -17,7 +17,6 @@ class WipingMujocoC:
     """25 steps of 2 ms of the MJCF, one environment after another."""
 
     name = "mujoco_c"
-    sequential_on_cpu = True
 
     def __init__(self) -> None:
         """Compile the scene."""

@@ -33,11 +33,9 @@ class Backend(Protocol):
 
     Attributes:
         name: "analytic", "mjx" or "mujoco_c".
-        sequential_on_cpu: See `ppl_jax.types.Env`.
     """
 
     name: str
-    sequential_on_cpu: bool
 
     def advance(self, state: Any, action: jax.Array, factors: Factors = NOMINAL) -> Any:
         """What a control step with an action in [-1, 1] does to the bodies of a state.
@@ -59,6 +57,7 @@ class ArmTask(Environment):
 
     tool: Tool
     base: np.ndarray
+    sequential_on_cpu = True
 
     def __init__(
         self,
@@ -78,7 +77,6 @@ class ArmTask(Environment):
         self.held_out_params = held_out_params
         self.experts = experts
         self.backend = backend
-        self.sequential_on_cpu = backend is None or backend.sequential_on_cpu
 
     @property
     def physics(self) -> str:

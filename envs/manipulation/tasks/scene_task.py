@@ -159,7 +159,6 @@ class SceneTask(ArmTask):
             for numbers in (training, held_out)
         ]
         super().__init__(*pools, experts=experts or {})
-        self.sequential_on_cpu = True
         self.scene, self.arm = scene, arm
         self.gripper: Any = gripper
         self._handled = [scene.body(name) for name in handled]
