@@ -460,7 +460,7 @@ def observe(scenario: Scenario, state: DrivingState) -> jax.Array:
         present=state.traffic.status != traffic_model.REMOVED,
         box_pose=state.box_pose,
     )
-    return jnp.concatenate([features, rays])
+    return obs.join(features, rays)
 
 
 @jax.jit

@@ -12,6 +12,8 @@ or when its own lane ends.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -86,6 +88,45 @@ def poses(scenario: Scenario, traffic: Traffic) -> jax.Array:
     return jnp.concatenate([position, (lane_heading(lane, traffic.long) - lean)[:, None]], -1)
 
 
+class Neighbours(NamedTuple):
+    """What is on the lanes, [J] each: lane, m along it, m/s."""
+
+    lane: jax.Array
+    long: jax.Array
+    speed: jax.Array
+
+
+def _neighbours(
+    others: Neighbours,
+    *,
+    beside: jax.Array,
+    ahead: jax.Array,
+    long: jax.Array,
+    left_over: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Distance to what is next ahead and its speed, and distance to what is last behind, [3, N].
+
+    Args:
+        others: What is on the lanes.
+        beside, ahead: [3, N] lanes left, here and right of each vehicle, and those they lead to.
+        long, left_over: [N] m along the vehicle's lane, and to its end.
+    """
+    front = behind = jnp.full(beside.shape, jnp.inf)
+    speed = jnp.zeros(beside.shape)
+    # unrolled, as the lidar's boxes: a reduction over so few runs one number at a time
+    for j in range(others.lane.shape[0]):
+        here, delta = others.lane[j] == beside, others.long[j] - long
+        distance = jnp.where(here & (delta > 0), delta, jnp.inf)
+        beyond = jnp.where(others.lane[j] == ahead, left_over + others.long[j], jnp.inf)
+        distance = jnp.minimum(distance, beyond)
+        speed = jnp.where(distance < front, others.speed[j], speed)
+        front = jnp.minimum(front, distance)
+        behind = jnp.minimum(behind, jnp.where(here & (delta < 0), -delta, jnp.inf))
+    # stored once: else the compiler computes the whole loop anew for each use
+    front, speed, behind = jax.lax.optimization_barrier(jnp.stack([front, speed, behind]))
+    return front, speed, behind
+
+
 def advance(
     scenario: Scenario,
     traffic: Traffic,
@@ -116,7 +157,7 @@ def advance(
     next_size = _at(plan.way_size, following)
     continues = next_first >= 0
 
-    # what is on the lanes left, here and right of each vehicle: [N, 3, J]
+    # what is on the lanes left, here and right of each vehicle: [3, N]
     present = status != REMOVED
     objects = scenario.objects
     other_lane = jnp.concatenate(
@@ -128,51 +169,50 @@ def advance(
     )
     other_long = jnp.concatenate([traffic.long, ego_long[None], objects.long])
     other_speed = jnp.concatenate([traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)])
-    side = jnp.array([-1, 0, 1])
-    beside_number = traffic.number[:, None] + side
-    exists = (beside_number >= 0) & (beside_number < size[:, None])
-    beside = jnp.where(exists, lane[:, None] + side, -1)[..., None]
-    ahead_number = beside_number + shift[:, None]
-    leads = continues[:, None] & (ahead_number >= 0) & (ahead_number < next_size[:, None])
-    ahead = jnp.where(leads & exists, next_first[:, None] + ahead_number, -1)[..., None]
-    here = other_lane == beside
-    delta = other_long - traffic.long[:, None, None]
-    left_over = (lanes.length[lane] - traffic.long)[:, None, None]
-    front = jnp.where(here & (delta > 0), delta, jnp.inf)
-    front = jnp.minimum(front, jnp.where(other_lane == ahead, left_over + other_long, jnp.inf))
-    behind = jnp.where(here & (delta < 0), -delta, jnp.inf)
-    nearest = jnp.argmin(front, -1)
-    gap = jnp.minimum(jnp.min(front, -1), SIGHT)
-    behind_gap = jnp.min(behind, -1)
+    side = jnp.array([-1, 0, 1])[:, None]
+    beside_number = traffic.number + side
+    exists = (beside_number >= 0) & (beside_number < size)
+    beside = jnp.where(exists, lane + side, -1)
+    ahead_number = beside_number + shift
+    leads = continues & (ahead_number >= 0) & (ahead_number < next_size)
+    ahead = jnp.where(leads & exists, next_first + ahead_number, -1)
+    front, its_speed, behind_gap = _neighbours(
+        Neighbours(other_lane, other_long, other_speed),
+        beside=beside,
+        ahead=ahead,
+        long=traffic.long,
+        left_over=lanes.length[lane] - traffic.long,
+    )
+    gap = jnp.minimum(front, SIGHT)
     seen = gap < SIGHT
-    front_speed = jnp.where(seen, other_speed[nearest], NO_LIMIT / 3.6) * 3.6
+    front_speed = jnp.where(seen, its_speed, NO_LIMIT / 3.6) * 3.6
 
     # lane changes: because the lane ends, or past something slow
     free = exists & (behind_gap > SAFE_GAP)
-    must = continues & ~leads[:, 1]
-    toward = jnp.where(traffic.number + shift < 0, 2, 0)  # the neighbour on the road's side
-    forced_free = jnp.take_along_axis(free, toward[:, None], 1)[:, 0] & (
-        jnp.take_along_axis(gap, toward[:, None], 1)[:, 0] > SMALL_GAP
-    )
+    must = continues & ~leads[1]
+    rightward = traffic.number + shift < 0  # where the neighbour on the road's side is
+    open_gap = free & (gap > SMALL_GAP)
+    forced_free = jnp.where(rightward, open_gap[2], open_gap[0])
     speed = traffic.speed * 3.6
     slow = (
-        seen[:, 1]
-        & (jnp.abs(front_speed[:, 1] - TARGET_SPEED) > 3.0)
+        seen[1]
+        & (jnp.abs(front_speed[1] - TARGET_SPEED) > 3.0)
         & (jnp.abs(speed - TARGET_SPEED) > 3.0)
         & (traffic.waited > PATIENCE)
     )
-    better = free & (gap > SAFE_GAP) & (front_speed > front_speed[:, 1:2] + 10.0)
-    better = better & (leads | ~continues[:, None])
-    choice = jnp.where(better[:, 0], -1, jnp.where(better[:, 2], 1, 0))
-    move = jnp.where(must, jnp.where(forced_free, toward - 1, 0), jnp.where(slow, choice, 0))
+    better = free & (gap > SAFE_GAP) & (front_speed > front_speed[1] + 10.0)
+    better = better & (leads | ~continues)
+    choice = jnp.where(better[0], -1, jnp.where(better[2], 1, 0))
+    forced = jnp.where(rightward, 1, -1)
+    move = jnp.where(must, jnp.where(forced_free, forced, 0), jnp.where(slow, choice, 0))
     move = jnp.where(driving, move, 0)
     target = jnp.where(must & ~forced_free, CREEP_SPEED, TARGET_SPEED)
 
     # the car-following law
-    index = (move + 1)[:, None]
-    distance = jnp.take_along_axis(gap, index, 1)[:, 0]
-    ahead_speed = jnp.take_along_axis(front_speed, index, 1)[:, 0]
-    has_front = jnp.take_along_axis(seen, index, 1)[:, 0]
+    distance, ahead_speed, has_front = (
+        jnp.where(move < 0, each[0], jnp.where(move > 0, each[2], each[1]))
+        for each in (gap, front_speed, seen)
+    )
     wanted = 10.0 + 1.5 * speed + speed * (speed - ahead_speed) / (2 * jnp.sqrt(5.0))
     throttle = 1.0 - (speed / target) ** 10
     throttle = throttle - jnp.where(has_front, (wanted / jnp.maximum(distance, 0.1)) ** 2, 0.0)

@@ -96,7 +96,7 @@ def _environment(env: Any, repeats: int) -> dict[str, float]:
         def run(states: Any, key: jax.Array, count: int = count, length: int = length) -> Any:
             def one(key: jax.Array, state: Any) -> Any:
                 obs, state, reward, *_ = env.step(key, state, action, params)
-                return state, obs[0] + obs[-1] + reward
+                return state, jnp.sum(obs) + reward
 
             def step(carry: Any, key: jax.Array) -> Any:
                 states, total = carry

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.driving import geometry, lidar, vehicle
+from envs.driving import geometry, lidar, observation, vehicle
 from envs.driving import navigation as nav
 from envs.driving.env import contacts
 from envs.driving.make import make_driving
@@ -409,3 +409,35 @@ def test_kerbs_are_felt_at_the_edge(world):
     assert bool(touches(jnp.array([25.0, y_touch - 0.05, 0.0])))
     _, found = nav.localise(scenario, state.navigation, jnp.array([25.0, 0.0, 0.0]))
     assert bool(found.on_lane)
+
+
+def test_an_observation_is_both_parts_in_a_row_however_it_is_batched_or_differentiated():
+    features, rays = jnp.linspace(0.1, 1.0, 19), jnp.linspace(0.0, 0.9, lidar.RAYS)
+    weights = jnp.linspace(-1.0, 1.0, observation.SIZE)
+    many = jnp.stack([features, 2 * features]), jnp.stack([rays, 3 * rays])
+
+    def joined(features, rays):
+        return jnp.sum(weights * observation.join(features, rays) ** 2)
+
+    def plain(features, rays):
+        return jnp.sum(weights * jnp.concatenate([features, rays]) ** 2)
+
+    def results(f):
+        return (
+            f(features, rays),
+            jax.vmap(f)(*many),
+            jax.vmap(f, (0, None))(many[0], rays),
+            jax.vmap(jax.vmap(f, (None, 0)), (0, None))(*many),
+            jax.grad(f, (0, 1))(features, rays),
+            jax.vmap(jax.grad(f, (0, 1)))(*many),
+            jax.grad(lambda *parts: jnp.sum(jax.vmap(f)(*parts)), (0, 1))(*many),
+            jax.jvp(f, (features, rays), (features, rays)),
+        )
+
+    assert jax.tree.all(
+        jax.tree.map(
+            lambda a, b: np.allclose(a, b, rtol=1e-5),
+            jax.jit(lambda: results(joined))(),
+            results(plain),
+        )
+    )
