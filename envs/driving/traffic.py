@@ -88,8 +88,8 @@ def poses(scenario: Scenario, traffic: Traffic) -> jax.Array:
     return jnp.concatenate([position, (lane_heading(lane, traffic.long) - lean)[:, None]], -1)
 
 
-class Neighbours(NamedTuple):
-    """What is on the lanes, [J] each: lane, m along it, m/s."""
+class _OnLanes(NamedTuple):
+    """Vehicles, ego and objects, [J] each: index of the lane (-2 off them), m along it, m/s."""
 
     lane: jax.Array
     long: jax.Array
@@ -97,19 +97,22 @@ class Neighbours(NamedTuple):
 
 
 def _neighbours(
-    others: Neighbours,
+    others: _OnLanes,
     *,
     beside: jax.Array,
     ahead: jax.Array,
     long: jax.Array,
     left_over: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Distance to what is next ahead and its speed, and distance to what is last behind, [3, N].
+) -> jax.Array:
+    """Distance to the next ahead, m, its speed, m/s, and distance to the last behind, [3, 3, N].
 
     Args:
         others: What is on the lanes.
         beside, ahead: [3, N] lanes left, here and right of each vehicle, and those they lead to.
         long, left_over: [N] m along the vehicle's lane, and to its end.
+
+    Returns:
+        The three, each on the lanes left, here and right; infinite (a speed 0) where there is none.
     """
     front = behind = jnp.full(beside.shape, jnp.inf)
     speed = jnp.zeros(beside.shape)
@@ -123,8 +126,7 @@ def _neighbours(
         front = jnp.minimum(front, distance)
         behind = jnp.minimum(behind, jnp.where(here & (delta < 0), -delta, jnp.inf))
     # stored once: else the compiler computes the whole loop anew for each use
-    front, speed, behind = jax.lax.optimization_barrier(jnp.stack([front, speed, behind]))
-    return front, speed, behind
+    return jax.lax.optimization_barrier(jnp.stack([front, speed, behind]))
 
 
 def advance(
@@ -160,15 +162,17 @@ def advance(
     # what is on the lanes left, here and right of each vehicle: [3, N]
     present = status != REMOVED
     objects = scenario.objects
-    other_lane = jnp.concatenate(
-        [
-            jnp.where(present, lane, -2),
-            ego_lane[None],
-            jnp.where(objects.lane < 0, -2, objects.lane),
-        ]
+    others = _OnLanes(
+        lane=jnp.concatenate(
+            [
+                jnp.where(present, lane, -2),
+                ego_lane[None],
+                jnp.where(objects.lane < 0, -2, objects.lane),
+            ]
+        ),
+        long=jnp.concatenate([traffic.long, ego_long[None], objects.long]),
+        speed=jnp.concatenate([traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)]),
     )
-    other_long = jnp.concatenate([traffic.long, ego_long[None], objects.long])
-    other_speed = jnp.concatenate([traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)])
     side = jnp.array([-1, 0, 1])[:, None]
     beside_number = traffic.number + side
     exists = (beside_number >= 0) & (beside_number < size)
@@ -177,7 +181,7 @@ def advance(
     leads = continues & (ahead_number >= 0) & (ahead_number < next_size)
     ahead = jnp.where(leads & exists, next_first + ahead_number, -1)
     front, its_speed, behind_gap = _neighbours(
-        Neighbours(other_lane, other_long, other_speed),
+        others,
         beside=beside,
         ahead=ahead,
         long=traffic.long,
