@@ -66,6 +66,9 @@ class HParams:
     world: Any = dataclasses.field(default_factory=NoHParams)
 
 
+_ROWS = 10_000
+
+
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """Static settings: they set shapes and programs.
@@ -158,6 +161,15 @@ class TrainConfig:
         choices=("sum", "mean"),
     )
     method: Any = dataclasses.field(default_factory=NoConfig)
+
+    @property
+    def human_rows(self) -> int:
+        """Rows of the buffers of steps: `human_capacity`, or as many as the run can fill.
+
+        The latter in whole tens of thousands, so that runs of most lengths are one program.
+        """
+        fillable = -(-self.total_steps // _ROWS) * _ROWS
+        return min(self.human_capacity, fillable)
 
 
 OWNED_CONFIG = ("method",)

@@ -336,11 +336,34 @@ def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
     return dataclasses.replace(learner, algorithm=updated, key=key, diverged=diverged), metrics
 
 
+def repeat(
+    step: Callable[[Learner], tuple[Learner, Metrics]], learner: Learner, times: int | jax.Array
+) -> tuple[Learner, Metrics]:
+    """Make `step` so many times; metrics are means over them.
+
+    Args:
+        step: `step(learner) -> (learner, metrics)`.
+        learner: Before the first.
+        times: May be traced: one program then serves any number.
+    """
+    step = jax.jit(step)  # traced once, for the shapes of its metrics and for the loop
+    sums = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, jnp.float32), jax.eval_shape(step, learner)[1]
+    )
+
+    def add(_: jax.Array, carry: tuple[Learner, Metrics]) -> tuple[Learner, Metrics]:
+        learner, metrics = step(carry[0])
+        return learner, jax.tree.map(jnp.add, carry[1], metrics)
+
+    learner, sums = jax.lax.fori_loop(0, times, add, (learner, sums))
+    return learner, jax.tree.map(lambda total: total / jnp.maximum(times, 1), sums)
+
+
 def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
     """Metrics of a chunk: mean losses, and what the counters say."""
     spent = jax.tree.map(lambda new, old: new - old, after, before)
     steps = jnp.maximum(spent.steps, 1)
-    metrics = {f"train/{name}": jnp.mean(value) for name, value in losses.items()}
+    metrics = {f"train/{name}": value for name, value in losses.items()}
     return metrics | {
         "train/human_data_usage": after.human_data,
         "train/intervention_rate": spent.human_data / steps,

@@ -25,6 +25,7 @@ from ppl_jax.interaction import (
     learn,
     make_problem,
     params_of,
+    repeat,
     sample_novice_action,
     summarise,
     transition_of,
@@ -46,12 +47,13 @@ class LiveFunctions(NamedTuple):
         play: `play(learner, takeover, action) -> (Learner, Interaction)`: one step, with `action`
             [A] where `takeover`, else with the novice's.
         learn: `learn(learner) -> (Learner, Metrics)`: one update.
-        fit: `fit(learner, updates) -> (Learner, Metrics)`: a static number of the updates that a
-            method makes on demonstrations before its first step.
+        fit: `fit(learner, updates) -> (Learner, Metrics)`: so many of the updates that a method
+            makes on demonstrations before its first step.
         restart: `restart(learner) -> Learner` at a new start, the episode left unfinished.
-        ingest: `ingest(learner, interactions [T], learning=True) -> (Learner, Metrics)`: use
-            recorded steps as if they were made now, with an update after each where `learning`.
-            With the settings and key of the recorded session, its policy results again.
+        ingest: `ingest(learner, interactions [T], learning=True, first=0, count=None) -> (Learner,
+            Metrics)`: use recorded steps, all from the first or `count` of them, as if they were
+            made now, with an update after each where `learning`. With the settings and key of the
+            recorded session, its policy results again.
         algorithm: The method.
     """
 
@@ -59,7 +61,7 @@ class LiveFunctions(NamedTuple):
     predict_path: Callable[[Learner, jax.Array, jax.Array], Trajectory]
     play: Callable[[Learner, jax.Array, jax.Array], tuple[Learner, Interaction]]
     learn: Callable[[Learner], tuple[Learner, Metrics]]
-    fit: Callable[[Learner, int], tuple[Learner, Metrics]]
+    fit: Callable[[Learner, int | jax.Array], tuple[Learner, Metrics]]
     restart: Callable[[Learner], Learner]
     ingest: Callable[..., tuple[Learner, Metrics]]
     algorithm: Algorithm
@@ -132,15 +134,10 @@ def play(
     return interact(problem, learner, started, jnp.clip(action, -1.0, 1.0))
 
 
-def fit(problem: Problem, learner: Learner, updates: int) -> tuple[Learner, Metrics]:
+def fit(problem: Problem, learner: Learner, updates: int | jax.Array) -> tuple[Learner, Metrics]:
     """See `LiveFunctions`."""
     update = problem.algorithm.fit or problem.algorithm.update
-
-    def step(learner: Learner, _: None) -> tuple[Learner, Metrics]:
-        return learn(learner, update)
-
-    learner, metrics = jax.lax.scan(step, learner, None, length=updates)
-    return learner, jax.tree.map(jnp.mean, metrics)
+    return repeat(lambda learner: learn(learner, update), learner, updates)
 
 
 def restart(problem: Problem, learner: Learner) -> Learner:
@@ -151,14 +148,23 @@ def restart(problem: Problem, learner: Learner) -> Learner:
 
 
 def ingest_all(
-    problem: Problem, learner: Learner, interactions: Interaction, learning: bool = True
+    problem: Problem,
+    learner: Learner,
+    interactions: Interaction,
+    learning: bool = True,
+    *,
+    first: int | jax.Array = 0,
+    count: int | jax.Array | None = None,
 ) -> tuple[Learner, Metrics]:
     """See `LiveFunctions.ingest`."""
     before = learner.counters
 
-    def step(learner: Learner, row: Interaction) -> tuple[Learner, Metrics]:
-        learner = ingest(problem, learner, row)
+    def step(learner: Learner) -> tuple[Learner, Metrics]:
+        at = first + learner.counters.steps - before.steps
+        learner = ingest(problem, learner, jax.tree.map(lambda column: column[at], interactions))
         return learn(learner, problem.algorithm.update) if learning else (learner, {})
 
-    learner, metrics = jax.lax.scan(step, learner, interactions)
+    if count is None:
+        count = interactions.reward.shape[0] - first
+    learner, metrics = repeat(step, learner, count)
     return learner, summarise(metrics, before, learner.counters)

@@ -30,6 +30,7 @@ from ppl_jax.interaction import (
     make_problem,
     params_of,
     query_expert,
+    repeat,
     sample_novice_action,
     summarise,
     transition_of,
@@ -47,9 +48,10 @@ class TrainFunctions(NamedTuple):
 
     Attributes:
         init: `init(key, hparams) -> Learner`.
-        run_chunk: `run_chunk(learner, blocks, phase="interact") -> (Learner, Metrics)` for a static
-            number of blocks of `decision_interval` steps (or updates, in phase "fit"); metrics
-            are means over the chunk.
+        run_chunk: `run_chunk(learner, blocks, phase="interact") -> (Learner, Metrics)` for a
+            number of blocks of `decision_interval` steps (or updates, in phase "fit"), which may
+            be traced: a run of any length, evaluated as often as one likes, is one program.
+            Metrics are means over the chunk.
         train: `train(key, hparams) -> (Learner, Metrics)`: the whole run, metrics per tenth of its
             last phase, [10].
         algorithm: The method.
@@ -225,13 +227,16 @@ def run_chunk(
     problem: Problem,
     takeovers: Takeovers,
     learner: Learner,
-    blocks: int,
+    blocks: int | jax.Array,
     phase: Phase = "interact",
 ) -> tuple[Learner, Metrics]:
-    """A static number of blocks of K steps (or updates, in phase "fit"); means over them."""
-    algorithm, length = problem.algorithm, blocks * problem.config.decision_interval
+    """So many blocks of K steps (or K updates each, in phase "fit"); metrics are means over them.
 
-    def one(learner: Learner, _: None) -> tuple[Learner, Metrics]:
+    `blocks` may be traced.
+    """
+    algorithm, interval = problem.algorithm, problem.config.decision_interval
+
+    def one(learner: Learner) -> tuple[Learner, Metrics]:
         if phase == "demonstrate":
             return demonstrate(problem, learner)
         if phase == "fit":
@@ -240,11 +245,11 @@ def run_chunk(
             return round_of_blocks(problem, takeovers, learner)
         return block(problem, takeovers, learner)
 
-    times = length
+    steps_of_one = 1
     if phase == "interact":
-        times = length // algorithm.update_every if algorithm.update_every > 1 else blocks
+        steps_of_one = max(algorithm.update_every, interval)
     before = learner.counters
-    learner, metrics = jax.lax.scan(one, learner, None, length=times)
+    learner, metrics = repeat(one, learner, blocks * interval // steps_of_one)
     return learner, summarise(metrics, before, learner.counters)
 
 

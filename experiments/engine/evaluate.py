@@ -37,8 +37,19 @@ class EvaluationRow(NamedTuple):
     length: int
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2, 3))
-def _episodes(env: Env, arrays: Any, activation: str, output: str, params: Any, key: jax.Array):
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def episodes(
+    env: Env, activation: str, output: str, arrays: Any, params: Any, key: jax.Array
+) -> Episodes:
+    """Every scenario of a pool once.
+
+    Args:
+        env: The environment.
+        activation, output: Of the policy's network.
+        arrays: Its weights, and mean and scale of its observations.
+        params: The pool.
+        key: For random worlds.
+    """
     weights, mean, scale = arrays
     policy = SavedPolicy(
         weights=weights, activation=activation, output=output, obs_mean=mean, obs_scale=scale
@@ -81,8 +92,8 @@ def evaluate_policy(
     params = env.held_out_params if on == "held_out" else env.default_params
     if hparams is not None:
         params = env_params(env, params, as_arrays(hparams))
-    episodes = _episodes(env, arrays, policy.activation, policy.output, params, jax.random.key(0))
-    return rows_of(episodes, env.scenario_numbers(params), step)
+    played = episodes(env, policy.activation, policy.output, arrays, params, jax.random.key(0))
+    return rows_of(played, env.scenario_numbers(params), step)
 
 
 def rows_of(episodes: Episodes, numbers: Any, step: int) -> list[EvaluationRow]:

@@ -70,16 +70,14 @@ def recorded_functions(
     interval = config.decision_interval
 
     def run_chunk(
-        learner: Learner, blocks: int, phase: Phase = "interact"
+        learner: Learner, blocks: int | jax.Array, phase: Phase = "interact"
     ) -> tuple[Learner, Metrics]:
         length, counters = blocks * interval, learner.counters
         if phase == "fit":
             learner, metrics = live.fit(learner, length)
             return learner, summarise(metrics, counters, learner.counters)
-        part = jax.tree.map(
-            lambda column: jax.lax.dynamic_slice_in_dim(column, counters.steps, length), rows
-        )
-        return live.ingest(learner, part, phase == "interact")
+        learning = phase == "interact"
+        return live.ingest(learner, rows, learning, first=counters.steps, count=length)
 
     def train(key: jax.Array, hparams: HParams) -> tuple[Learner, Metrics]:
         learner, metrics = live.init(key, hparams), {}

@@ -17,15 +17,17 @@ import numpy as np
 
 from experiments.engine.evaluate import (
     arrays_of,
-    evaluate_policy,
     make_env,
     named_expert,
     physics_of,
     read_evaluation,
     read_policy,
+    rows_of,
     summarise_episodes,
 )
+from experiments.engine.plan import Chunk, plan
 from experiments.engine.policy_file import save_policy
+from experiments.engine.programs import NETWORK, Programs
 from experiments.engine.progress import Progress
 from experiments.engine.recorded import recorded_functions, recording_of
 from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
@@ -37,11 +39,10 @@ from experiments.engine.settings import (
     refuse_contradictions,
 )
 from ppl_jax import algorithms, checkpoint, experts
-from ppl_jax.config import TrainConfig
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.interaction import Counters, Learner
 from ppl_jax.networks import Layers
-from ppl_jax.training import Phase, TrainFunctions, make_train, phases
+from ppl_jax.training import TrainFunctions, make_train
 from ppl_jax.types import Env, Expert
 
 
@@ -89,8 +90,8 @@ def saved_policy(env: Env, layers: Layers) -> SavedPolicy:
     weights = [(np.asarray(w), np.asarray(b)) for w, b in layers]
     return SavedPolicy(
         weights=weights,
-        activation="relu",
-        output="tanh",
+        activation=NETWORK[0],
+        output=NETWORK[1],
         obs_mean=env.spec.observation_mean,
         obs_scale=env.spec.observation_scale,
     )
@@ -121,22 +122,24 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             f"{settings.algorithm}, got {settings.evaluate_every}"
         )
     open_folder(folder, settings.as_json(), resume)
-    learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
-    plan = _plan(settings.config, settings.evaluate_every)
+    interval = settings.config.decision_interval
+    programs = Programs(env, functions, interval, on=settings.evaluate_on)
+    learner = programs.init(jax.random.key(settings.seed), settings.hparams)
+    chunks = plan(settings.config, settings.evaluate_every)
     done = 0
     if resume:
         done, learner = restore_learner(folder, learner)
-        evaluated = [chunk.step for chunk in plan if chunk.evaluate and chunk.end <= done]
+        evaluated = [chunk.step for chunk in chunks if chunk.evaluate and chunk.end <= done]
         folder.rewind(done, max(evaluated, default=-1))
-        if done >= plan[-1].end:
+        if done >= chunks[-1].end:
             print(f"{out} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
-    with Progress(plan[-1].end, f"train {settings.env}", done) as progress:
-        runner = _Runner(settings, folder, env=env, functions=functions, progress=progress)
-        waiting = [chunk for chunk in plan if chunk.end > done]
-        runner.compile(learner, waiting[-1])
+    with Progress(chunks[-1].end, f"train {settings.env}", done) as progress:
+        name = f"{settings.algorithm} in {settings.where}"
+        programs.announce = lambda what: progress.compiling(f"{name}, {what}")
+        runner = _Runner(settings, folder, programs)
         progress.start()
-        for chunk in waiting:
+        for chunk in (chunk for chunk in chunks if chunk.end > done):
             learner, note = runner.run(learner, chunk)
             progress.update(chunk.end, note)
     return runner.finish(learner, time.perf_counter() - began)
@@ -151,59 +154,6 @@ def _functions(settings: RunSettings) -> tuple[Env, TrainFunctions]:
     return env, recorded_functions(
         env, algorithm_factory(settings, env), settings.config, recording
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Chunk:
-    """A piece of a run between two returns to the host.
-
-    Attributes:
-        phase: Phase of the loop.
-        length: Steps (updates in phase "fit").
-        end: Steps and offline updates of the run by then: what progress and checkpoints count.
-        step: Environment steps of the run by then.
-        evaluate: Whether the policy is evaluated then.
-    """
-
-    phase: Phase
-    length: int
-    end: int
-    step: int
-    evaluate: bool
-
-
-def _plan(config: TrainConfig, evaluate_every: int) -> list[_Chunk]:
-    """The chunks of a run; those of a phase are alike, its last may be shorter."""
-    plan: list[_Chunk] = []
-    end = step = 0
-    for phase, length in phases(config):
-        interact = phase == "interact"
-        size = evaluate_every if interact else _part(length, config.decision_interval)
-        left = length
-        while left:
-            piece = min(size, left)
-            left, end = left - piece, end + piece
-            step += 0 if phase == "fit" else piece
-            # what demonstrations alone teach is seen once, when they are learnt
-            plan.append(
-                _Chunk(
-                    phase=phase,
-                    length=piece,
-                    end=end,
-                    step=step,
-                    evaluate=interact or (phase == "fit" and not left),
-                )
-            )
-    if not plan[-1].evaluate:  # demonstrations that nothing is learnt from
-        plan[-1] = dataclasses.replace(plan[-1], evaluate=True)
-    return plan
-
-
-def _part(length: int, interval: int) -> int:
-    """A tenth of a long phase, in whole blocks."""
-    blocks = length // interval
-    parts = max(n for n in range(1, 11) if blocks % n == 0) if length >= 5000 else 1
-    return length // parts
 
 
 def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> None:
@@ -306,61 +256,32 @@ def _restore(folder: RunFolder, learner: Any) -> tuple[int, Any]:
 
 
 class _Runner:
-    """Compiled functions of a run and what happens between its chunks."""
+    """What happens between the chunks of a run."""
 
-    def __init__(
-        self,
-        settings: RunSettings,
-        folder: RunFolder,
-        *,
-        env: Env,
-        functions: TrainFunctions,
-        progress: Progress,
-    ):
-        self.settings, self.folder, self.env, self.functions = settings, folder, env, functions
-        self.progress = progress
-        self.compile_s = self.train_s = 0.0
+    def __init__(self, settings: RunSettings, folder: RunFolder, programs: Programs):
+        self.settings, self.folder, self.programs = settings, folder, programs
+        self.env = programs.env
+        self.train_s = 0.0
         self.trained_steps = 0
-        self.programs: dict[tuple[Phase, int], Callable[[Learner], Any]] = {}
 
-    def _program(self, learner: Learner, chunk: _Chunk) -> Callable[[Learner], Any]:
-        kind = (chunk.phase, chunk.length)
-        if kind not in self.programs:
-            blocks = chunk.length // self.settings.config.decision_interval
-
-            def run(learner: Learner) -> Any:
-                return self.functions.run_chunk(learner, blocks, chunk.phase)
-
-            began = time.perf_counter()
-            jitted = jax.jit(run, donate_argnums=0)
-            what = f"{self.settings.algorithm} in {self.settings.where}, {chunk.phase}"
-            with self.progress.compiling(what, f"{what}, {chunk.length} steps"):
-                self.programs[kind] = jitted.lower(learner).compile()
-            self.compile_s += time.perf_counter() - began
-        return self.programs[kind]
-
-    def compile(self, learner: Learner, chunk: _Chunk) -> None:
-        """Compile a chunk's program ahead of time."""
-        self._program(learner, chunk)
-
-    def run(self, learner: Learner, chunk: _Chunk) -> tuple[Learner, str]:
+    def run(self, learner: Learner, chunk: Chunk) -> tuple[Learner, str]:
         """Train to the end of a chunk, evaluate, log, save; returns learner and a note."""
-        program = self._program(learner, chunk)
-        began = time.perf_counter()
-        learner, metrics = jax.block_until_ready(program(learner))
-        seconds = time.perf_counter() - began
+        began, compiled = time.perf_counter(), self.programs.compile_s
+        learner, metrics = jax.block_until_ready(
+            self.programs.chunk(learner, chunk.length, chunk.phase)
+        )
+        seconds = time.perf_counter() - began - (self.programs.compile_s - compiled)
         if chunk.phase == "interact":
             self.train_s += seconds
             self.trained_steps += chunk.length
-        layers = self.functions.algorithm.policy(learner.algorithm)
+        layers = self.programs.functions.algorithm.policy(learner.algorithm)
         human = int(learner.counters.human_data)
         row = {"step": chunk.step, "done": chunk.end, "phase": chunk.phase}
         row |= {name: float(value) for name, value in metrics.items()}
         note = f"human data {human}"
         if chunk.evaluate:
-            policy, on = saved_policy(self.env, layers), self.settings.evaluate_on
-            hparams = self.settings.hparams
-            rows = evaluate_policy(self.env, policy, chunk.step, on, hparams=hparams)
+            numbers = self.env.scenario_numbers(self.programs.pool)
+            rows = rows_of(self.programs.evaluate(learner), numbers, chunk.step)
             scores = summarise_episodes(rows)
             self.folder.append_evaluation([r._asdict() | {"human_data_usage": human} for r in rows])
             row |= {f"eval/{name}": value for name, value in scores.items()}
@@ -372,7 +293,7 @@ class _Runner:
             note += ", DIVERGED: the policy stays as it was"
         return learner, note
 
-    def _save(self, chunk: _Chunk, learner: Learner, layers: Layers) -> None:
+    def _save(self, chunk: Chunk, learner: Learner, layers: Layers) -> None:
         save_policy(
             self.folder.path / POLICY,
             saved_policy(self.env, layers),
@@ -405,7 +326,7 @@ class _Runner:
             "diverged": bool(learner.diverged),
             **physics_of(self.env),
             "wall_s": round(wall_s, 1),
-            "compile_s": round(self.compile_s, 1),
+            "compile_s": round(self.programs.compile_s, 1),
             "steps_per_s": round(self.trained_steps / max(self.train_s, 1e-9), 1),
         }
         self.folder.write_json(SUMMARY, summary)

@@ -100,6 +100,19 @@ _PLAIN = tuple(
 )
 
 
+def program_key(settings: RunSettings) -> tuple[str, ...]:
+    """Equal for runs that share their programs."""
+    config = dataclasses.replace(
+        settings.config, total_steps=settings.config.human_rows, offline_updates=0
+    )
+    static = dataclasses.replace(
+        settings, seed=0, hparams=HParams(), config=config, evaluate_every=0
+    )
+    owners = settings.hparams.gate, settings.hparams.predictor
+    parts = [getattr(static, field.name) for field in dataclasses.fields(static)]
+    return tuple(str(part) for part in (*parts, *map(type, owners)))
+
+
 def schema_of(content: Mapping[str, Any]) -> int:
     """The schema version of a config.json; the first wrote none.
 

@@ -6,10 +6,17 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from experiments.engine.plan import Chunk
+    from experiments.engine.programs import Look, Programs
+    from experiments.engine.settings import RunSettings
+    from ppl_jax.types import Env
 
 Job = dict[str, Any]
 Reply = dict[str, Any]
@@ -23,7 +30,7 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self.programs: dict[str, Any] = {}
+        self.programs: dict[tuple[Any, ...], Programs] = {}
 
     def run(self, job: Job) -> Reply:
         """Result of a job; a mistake or a failure is a reply too."""
@@ -38,97 +45,92 @@ class Worker:
             return {"error": f"{type(error).__name__}: {first}"}
 
     def _run(self, job: Job) -> Reply:
-        import jax
-
+        from experiments.engine.plan import plan
         from experiments.engine.settings import RunSettings
-        from ppl_jax.config import replace
-        from ppl_jax.sweep import split, stack
 
-        batch = job["runs"]
-        seeds = [run["seed"] for run in batch]
         settings = RunSettings.from_json(job["settings"])
-        hparams = [replace(settings.config, settings.hparams, **run["hparams"])[1] for run in batch]
-        keys = jax.vmap(jax.random.key)(np.array(seeds, np.uint32))
-        traced = (keys, stack(hparams))
-        if job["side_by_side"]:
-            traced = split(traced, jax.devices())
-        program, env, compile_s = self._program(job, traced)
-        began = time.perf_counter()
-        params = env.held_out_params
-        if settings.evaluate_on == "training":
-            params = env.default_params
-        curve, layers = jax.block_until_ready(program(*traced, params))
-        seconds = time.perf_counter() - began
-        numbers = env.scenario_numbers(params)
-        layers = jax.tree.map(np.asarray, layers)
-        curve = jax.tree.map(np.asarray, curve)
-        runs = [
-            {"index": run["index"]}
-            | _rows(job, jax.tree.map(lambda leaf, i=i: leaf[i], curve), numbers)
-            for i, run in enumerate(batch)
-        ]
-        if job.get("policies"):
-            _save_policies(job, settings, env, layers)
+        programs = self._programs(settings, job["side_by_side"])
+        chunks = plan(settings.config, settings.evaluate_every)
+        numbers = programs.env.scenario_numbers(programs.pool)
+        began, compiled = time.perf_counter(), programs.compile_s
+        runs = []
+        for run, looks, layers in _played(programs, settings, job, chunks):
+            runs.append({"index": run["index"]} | _rows(looks, numbers))
+            if job.get("policies"):
+                _save_policy(job["policies"], run, settings, programs.env, layers=layers)
+        compile_s = programs.compile_s - compiled
+        seconds = time.perf_counter() - began - compile_s
         return {"compile_s": compile_s, "seconds": seconds, "runs": runs}
 
-    def _program(self, job: Job, traced: Any) -> tuple[Any, Any, float]:
-        """The compiled batch of these settings, its environment, and the seconds that took."""
-        import jax
-
+    def _programs(self, settings: RunSettings, side_by_side: bool) -> Programs:
+        """The programs of these settings: the same for runs of most lengths."""
+        from experiments.engine.programs import Programs
         from experiments.engine.run import algorithm_factory, make_env_and_expert
-        from experiments.engine.settings import RunSettings
-        from ppl_jax.sweep import make_batch, make_run
+        from experiments.engine.settings import program_key
         from ppl_jax.training import make_train
 
-        key = json.dumps([job["settings"], len(job["runs"]), job["side_by_side"]], sort_keys=True)
-        if key in self.programs:
-            return *self.programs[key], 0.0
-        settings = RunSettings.from_json(job["settings"])
-        env, expert = make_env_and_expert(settings)
-        functions = make_train(env, expert, algorithm_factory(settings, env), settings.config)
-        lane = make_run(env, functions, settings.config, settings.evaluate_every, keep_policy=True)
-        batch = make_batch(lane, job["side_by_side"])
-        params = env.held_out_params
-        if settings.evaluate_on == "training":
-            params = env.default_params
-        began = time.perf_counter()
-        program = jax.jit(batch).lower(*traced, params).compile()
-        self.programs[key] = (program, env)
-        return program, env, time.perf_counter() - began
+        key = (*program_key(settings), side_by_side)
+        if key not in self.programs:
+            env, expert = make_env_and_expert(settings)
+            functions = make_train(env, expert, algorithm_factory(settings, env), settings.config)
+            self.programs[key] = Programs(
+                env,
+                functions,
+                settings.config.decision_interval,
+                on=settings.evaluate_on,
+                side_by_side=side_by_side,
+            )
+        return self.programs[key]
 
 
-def _save_policies(job: Job, settings: Any, env: Any, layers: Any) -> None:
-    """Write the trained policy of each run to the job's folder."""
+def _played(
+    programs: Programs, settings: RunSettings, job: Job, chunks: list[Chunk]
+) -> Iterator[tuple[dict[str, Any], list[Look], Any]]:
+    """Each run of a job with what its evaluations found, and its policy's layers."""
     import jax
 
+    from ppl_jax.config import replace
+    from ppl_jax.sweep import split, stack
+
+    batch = job["runs"]
+    keys = jax.vmap(jax.random.key)(np.array([run["seed"] for run in batch], np.uint32))
+    hparams = [replace(settings.config, settings.hparams, **run["hparams"])[1] for run in batch]
+    if job["side_by_side"]:
+        keys, many = split((keys, stack(hparams)), jax.devices())
+        looks, layers = programs.play(keys, many, chunks)
+        for i, run in enumerate(batch):
+            mine = jax.tree.map(lambda leaf, i=i: leaf[i], layers)
+            yield run, [look.of(i) for look in looks], mine
+        return
+    for i, run in enumerate(batch):
+        yield run, *programs.play(keys[i], hparams[i], chunks)
+
+
+def _save_policy(
+    folder: str, run: dict[str, Any], settings: RunSettings, env: Env, *, layers: Any
+) -> None:
+    """Write the trained policy of a run to a folder."""
     from experiments.engine.policy_file import save_policy
     from experiments.engine.run import saved_policy
 
-    folder = Path(job["policies"])
-    folder.mkdir(parents=True, exist_ok=True)
-    for i, run in enumerate(job["runs"]):
-        mine = jax.tree.map(lambda leaf, i=i: leaf[i], layers)
-        about = {"env": settings.env, "algorithm": settings.algorithm, "seed": run["seed"]}
-        about["step"] = settings.config.total_steps
-        save_policy(folder / run["policy"], saved_policy(env, mine), about)
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    about = {"env": settings.env, "algorithm": settings.algorithm, "seed": run["seed"]}
+    about["step"] = settings.config.total_steps
+    save_policy(Path(folder) / run["policy"], saved_policy(env, layers), about)
 
 
-def _rows(job: Job, curve: Any, numbers: Any) -> Reply:
+def _rows(looks: list[Look], numbers: Any) -> Reply:
     """One run's rows: one per evaluation, and one per scenario of the last evaluation."""
     from experiments.engine.evaluate import rows_of
-    from experiments.engine.settings import RunSettings
-    from ppl_jax.evaluation import Episodes
-    from ppl_jax.sweep import evaluation_steps
 
-    settings = RunSettings.from_json(job["settings"])
     rows, last = [], []
-    for at, step in enumerate(evaluation_steps(settings.config, settings.evaluate_every)):
-        counters = {name: getattr(curve.counters, name)[at].item() for name in _COUNTED}
-        last = rows_of(Episodes(*(column[at] for column in curve.episodes)), numbers, step)
+    for look in looks:
+        counters = {name: getattr(look.counters, name).item() for name in _COUNTED}
+        last = rows_of(look.episodes, numbers, look.step)
         means = {name: f"{np.mean([getattr(row, name) for row in last]):.6g}" for name in _SCORES}
         row = {
-            "step": step,
-            "status": "diverged" if curve.diverged[at] else "done",
+            "step": look.step,
+            "status": "diverged" if look.diverged else "done",
             "human_data_usage": counters["human_data"],
             "takeovers": counters["takeovers"],
             "training_cost": f"{counters['cost']:g}",

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import RunSettings
-from ppl_jax.config import HParams, catalogue, replace, values
+from experiments.engine.settings import RunSettings, program_key
+from ppl_jax.config import catalogue, replace, values
 
 Values = Mapping[str, Sequence[Any]]
 
@@ -118,7 +118,7 @@ class Run:
 
 @dataclasses.dataclass
 class Group:
-    """Runs that differ only in what is traced: one program.
+    """Runs that differ only in what is traced.
 
     Attributes:
         settings: Settings of its first run.
@@ -153,11 +153,10 @@ def plain(value: Any) -> str:
 
 
 def group_key(settings: RunSettings) -> tuple:
-    """Equal for runs that share a program."""
-    static = dataclasses.replace(settings, seed=0, hparams=HParams())
-    owners = settings.hparams.gate, settings.hparams.predictor
-    parts = [getattr(static, field.name) for field in dataclasses.fields(static)]
-    return tuple(str(part) for part in (*parts, *map(type, owners)))
+    """Equal for runs that share their programs and are evaluated at the same steps."""
+    config = settings.config
+    length = config.total_steps, config.offline_updates, settings.evaluate_every
+    return (*program_key(settings), *length)
 
 
 def groups(runs: Sequence[Run]) -> list[Group]:

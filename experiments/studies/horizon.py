@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
+from experiments.engine.programs import Programs
 from experiments.engine.progress import Progress
 from experiments.engine.run import algorithm_factory, make_env_and_expert
 from experiments.engine.runtime import UserError
@@ -51,7 +52,7 @@ def measure_horizon(command: Horizon) -> None:
         profile = make_profile(env, expert, config)
     except ValueError as error:
         raise UserError(str(error)) from error
-    chunk = jax.jit(lambda learner: functions.run_chunk(learner, every // interval)[0])
+    programs = Programs(env, functions, interval)
 
     @jax.jit
     def look(key: jax.Array, learner: Learner) -> Any:
@@ -66,9 +67,9 @@ def measure_horizon(command: Horizon) -> None:
     with Progress(len(command.seeds) * stops, f"measure {command.env}") as progress:
         progress.start()
         for number, seed in enumerate(command.seeds):
-            learner = jax.jit(functions.init)(jax.random.key(seed), settings.hparams)
+            learner = programs.init(jax.random.key(seed), settings.hparams)
             for stop in range(1, stops + 1):
-                learner = chunk(learner)
+                learner, _ = programs.chunk(learner, every, "interact")
                 found = look(jax.random.fold_in(jax.random.key(seed), stop), learner)
                 rows += _rows(command.env, seed, stop * every, found)
                 write_rows(command.out, rows)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ppl_jax.experts import SavedPolicy
+    from ppl_jax.types import Env
 
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
 
@@ -105,8 +106,8 @@ def train(
 ) -> Result:
     """Train one policy, or one for every combination of seeds and settings given as lists.
 
-    All runs are one compiled program. On a CPU they run one after another, on accelerators side by
-    side.
+    All runs share their compiled programs. On a CPU they run one after another, on accelerators
+    side by side.
 
     Args:
         env: Name of the environment.
@@ -168,8 +169,8 @@ def _train(
             run = dataclasses.replace(widest, seed=number, config=config, hparams=hparams)
             check(run)
             settings.append(run)
-    histories, layers, numbers = _run(widest, settings)
-    return _result(settings, {**swept, "seed": seeds}, histories, layers, numbers=numbers)
+    built, played = _played(widest, settings)
+    return _result(settings, {**swept, "seed": seeds}, built, played)
 
 
 def _several(name: str, value: Any) -> list[Any] | None:
@@ -237,12 +238,14 @@ def _check_kind(setting: Setting, value: Any) -> None:
         raise UserError(f"{setting.name} must be a whole number, got {value!r}")
 
 
-def _run(widest: RunSettings, settings: list[RunSettings]) -> tuple[Any, Any, Any]:
-    """All runs as one program: histories [R, P, ...], layers of policies [R, ...], scenarios."""
+def _played(widest: RunSettings, settings: list[RunSettings]) -> tuple[Env, list[Any]]:
+    """The environment, and for each run what its evaluations found and its policy's layers."""
     import jax
 
+    from experiments.engine.plan import plan
+    from experiments.engine.programs import Programs
     from experiments.engine.run import algorithm_factory, make_env_and_expert
-    from ppl_jax.sweep import make_batch, make_run, stack
+    from ppl_jax.sweep import stack
     from ppl_jax.training import make_train
 
     env, expert = make_env_and_expert(widest)
@@ -250,57 +253,47 @@ def _run(widest: RunSettings, settings: list[RunSettings]) -> tuple[Any, Any, An
         functions = make_train(env, expert, algorithm_factory(widest, env), widest.config)
     except ValueError as error:
         raise UserError(str(error)) from error
-    run = make_run(env, functions, widest.config, widest.evaluate_every, keep_policy=True)
-    batch = jax.jit(make_batch(run, side_by_side=jax.default_backend() != "cpu"))
+    side_by_side = jax.default_backend() != "cpu"
+    interval = widest.config.decision_interval
+    programs = Programs(env, functions, interval, side_by_side=side_by_side)
+    chunks = plan(widest.config, widest.evaluate_every)
     keys = jax.vmap(jax.random.key)(np.array([one.seed for one in settings], np.uint32))
-    hparams = stack([one.hparams for one in settings])
-    history, layers = jax.tree.map(np.asarray, batch(keys, hparams, env.held_out_params))
-    return history, (layers, env.spec), env.scenario_numbers(env.held_out_params)
+    if not side_by_side:
+        runs = zip(keys, settings, strict=True)
+        return env, [programs.play(key, one.hparams, chunks) for key, one in runs]
+    looks, layers = programs.play(keys, stack([one.hparams for one in settings]), chunks)
+    return env, [
+        ([look.of(i) for look in looks], jax.tree.map(lambda leaf, i=i: leaf[i], layers))
+        for i in range(len(settings))
+    ]
 
 
 def _result(
-    settings: list[RunSettings],
-    axes: Mapping[str, tuple[Any, ...]],
-    history: Any,
-    layers: Any,
-    *,
-    numbers: Any,
+    settings: list[RunSettings], axes: Mapping[str, tuple[Any, ...]], env: Env, played: list[Any]
 ) -> Result:
-    import jax
     import pandas as pd
 
     from experiments.engine.evaluate import rows_of
-    from ppl_jax.experts import SavedPolicy
-    from ppl_jax.sweep import evaluation_steps
+    from experiments.engine.run import saved_policy
 
-    weights, spec = layers
+    numbers = env.scenario_numbers(env.held_out_params)
     curve, episodes, policies = [], [], []
-    for number, (run, chosen) in enumerate(
-        zip(settings, itertools.product(*axes.values()), strict=True)
+    for number, (chosen, (looks, layers)) in enumerate(
+        zip(itertools.product(*axes.values()), played, strict=True)
     ):
         where = {"run": number, **dict(zip(axes, chosen, strict=True))}
-        mine = jax.tree.map(lambda leaf, i=number: leaf[i], history)
         rows = []
-        for at, step in enumerate(evaluation_steps(run.config, run.evaluate_every)):
-            played = jax.tree.map(lambda leaf, i=at: leaf[i], mine.episodes)
-            rows = rows_of(played, numbers, step)
+        for look in looks:
+            rows = rows_of(look.episodes, numbers, look.step)
             means = {name: np.mean([getattr(row, name) for row in rows]) for name in SCORES}
-            human = int(mine.counters.human_data[at])
+            human = int(look.counters.human_data)
             curve.append(
-                {**where, "step": step, "human_data_usage": human}
+                {**where, "step": look.step, "human_data_usage": human}
                 | means
-                | {"diverged": bool(mine.diverged[at])}
+                | {"diverged": bool(look.diverged)}
             )
         episodes += [where | row._asdict() for row in rows]
-        policies.append(
-            SavedPolicy(
-                weights=[(w[number], b[number]) for w, b in weights],
-                activation="relu",
-                output="tanh",
-                obs_mean=spec.observation_mean,
-                obs_scale=spec.observation_scale,
-            )
-        )
+        policies.append(saved_policy(env, layers))
     return Result(
         settings=tuple(settings),
         axes=axes,

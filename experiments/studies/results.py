@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments.engine.files import write_text_atomic
+from experiments.engine.plan import evaluation_steps
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import ADDED, traced_values
 from experiments.report.tables import EPISODES, RESULTS
 from experiments.studies.grid import Run, plain, show
 from ppl_jax.config import values
-from ppl_jax.sweep import evaluation_steps
 
 DONE, DIVERGED, FAILED = "done", "diverged", "failed"
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")

@@ -22,6 +22,7 @@ from experiments.engine.settings import (
     default_interval,
     flat,
     one_level,
+    program_key,
     run_settings,
     traced_values,
 )
@@ -31,7 +32,6 @@ from experiments.studies.grid import (
     Group,
     Run,
     Study,
-    group_key,
     groups,
     points,
     run_name,
@@ -259,7 +259,7 @@ def _program(run: Run) -> tuple[str, str]:
     """The name of a run's program, for people and in the log of compile times."""
     settings = run.settings
     name = f"{settings.algorithm} in {settings.where}"
-    return name, f"sweep: {name}, {settings.config.total_steps} steps"
+    return name, f"sweep: {name}"
 
 
 def policy_name(run: str) -> str:
@@ -333,7 +333,7 @@ def _tell_plan(runs: Sequence[Run], waiting: Sequence[Run], execution: Execution
             continue  # its runs will say so; the others go on
         memory = max(memory, run_bytes(made, group.settings.hparams))
     batch = execution.batch or _batch(memory, len(waiting))
-    compiles = len({(group_key(g.settings), min(len(g.runs), batch)) for g in wanted})
+    compiles = len({program_key(group.settings) for group in wanted})
     minutes = (seconds + COMPILE_S * compiles * min(workers, 2)) / workers / 60
     print(
         f"{len(runs)} runs, {len(runs) - len(waiting)} of them done; {steps:,} steps to go in "

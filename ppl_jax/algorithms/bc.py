@@ -46,7 +46,7 @@ class ClonerState:
 def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> ClonerState:
     """Before the first step."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-    rows = min(config.human_capacity, config.total_steps)
+    rows = config.human_rows
     return ClonerState(
         learned=init_learned(policy.init(key)), human_buffer=buffers.init_buffer(item, rows)
     )

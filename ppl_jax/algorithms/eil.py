@@ -171,7 +171,7 @@ def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainC
     """Before the first step."""
     key_actor, key_critic = jax.random.split(key)
     observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
-    rows, window = min(config.human_capacity, config.total_steps), config.decision_interval
+    rows, window = config.human_rows, config.decision_interval
     labelled = LabelledSteps(observation=observation, action=action, good=jnp.zeros((), bool))
     return EILState(
         learned=ActorCritic(

@@ -36,7 +36,7 @@ class IWRState:
 def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> IWRState:
     """Before the first step."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
-    rows = min(config.human_capacity, config.total_steps)
+    rows = config.human_rows
     return IWRState(
         learned=init_learned(policy.init(key)), steps=buffers.init_split(item, rows, rows)
     )

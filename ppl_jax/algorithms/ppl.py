@@ -177,9 +177,7 @@ def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConf
     measured = horizon.init_horizon(method.max_preference_horizon)
     return PPLState(
         learned=init_learned(policy.init(key)),
-        human_buffer=buffers.init_buffer(
-            (observation, action), min(config.human_capacity, config.total_steps)
-        ),
+        human_buffer=buffers.init_buffer((observation, action), config.human_rows),
         preference_buffer=buffers.init_buffer(pair, method.preference_capacity),
         random_actions=actions,
         horizon=measured if method.adaptive_horizon else None,

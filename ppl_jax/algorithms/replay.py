@@ -76,7 +76,7 @@ def init_replay(spec: EnvSpec, config: TrainConfig) -> SplitBuffer:
         takeover_start=no,
         terminated=no,
     )
-    rows = min(config.human_capacity, config.total_steps)
+    rows = config.human_rows
     return buffers.init_split(item, rows, rows)
 
 

@@ -155,7 +155,7 @@ def init_state(
             discrepancy=jnp.zeros(()),
         ),
         human=init_bootstrap(key_data, spec, config),
-        steps=buffers.init_buffer(item, min(config.human_capacity, config.total_steps)),
+        steps=buffers.init_buffer(item, config.human_rows),
         goals=buffers.init_buffer(item, GOALS),
         recent=buffers.init_buffer((jnp.zeros(()), jnp.zeros(())), RECENT),
     )

@@ -16,13 +16,15 @@ import pytest
 
 import envs
 from experiments.engine.evaluate import evaluate_run
+from experiments.engine.plan import evaluation_steps, plan
+from experiments.engine.programs import Programs
 from experiments.engine.run import algorithm_factory, make_env_and_expert, train
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, traced_values
 from experiments.engine.worker import Worker
 from experiments.options.commands import Sweep
 from experiments.studies import grid, quick
-from experiments.studies.runner import plan
+from experiments.studies.runner import plan as planned
 from ppl_jax import sweep as pure
 from ppl_jax.cards import EnvCard
 from ppl_jax.config import replace
@@ -47,13 +49,13 @@ def settings_of(name, seed=0, **changes):
     return RunSettings("probe", name, seed, config, hparams, evaluate_every=20)
 
 
-def lane_of(settings):
+def programs_of(settings, side_by_side=False):
     env, expert = make_env_and_expert(settings)
     functions = make_train(env, expert, algorithm_factory(settings, env), settings.config)
-    return env, pure.make_run(env, functions, settings.config, settings.evaluate_every)
+    return Programs(env, functions, settings.config.decision_interval, side_by_side=side_by_side)
 
 
-# --- a run as one function ---
+# --- a run's programs ---
 
 
 @pytest.mark.parametrize(
@@ -65,39 +67,44 @@ def lane_of(settings):
         ("pvp", {"total_steps": 50}),  # the last evaluation comes early
     ],
 )
-def test_a_lane_is_the_run_that_ppl_train_makes(name, changes, tmp_path):
+def test_a_sweeps_run_is_the_one_that_ppl_train_makes(name, changes, tmp_path):
     settings = settings_of(name, 3, **changes)
     summary = train(settings, tmp_path / "run")
-    env, lane = lane_of(settings)
-    curve = jax.jit(lane)(jax.random.key(3), settings.hparams, env.held_out_params)
+    run = {"index": 0, "seed": 3, "hparams": traced_values(settings)}
+    job = {"settings": settings.as_json(), "side_by_side": False, "runs": [run]}
+    (mine,) = Worker().run(json.loads(json.dumps(job)))["runs"]
     theirs = rows_of(tmp_path / "run" / "evaluation.csv")
-    steps = pure.evaluation_steps(settings.config, settings.evaluate_every)
+    steps = evaluation_steps(settings.config, settings.evaluate_every)
+    assert [row["step"] for row in mine["rows"]] == steps
     assert sorted({int(row["step"]) for row in theirs}) == steps
-    for at, step in enumerate(steps):
-        mine = [row for row in theirs if int(row["step"]) == step]
-        assert [bool(int(row["success"])) for row in mine] == curve.episodes.success[at].tolist()
-        costs = [float(row["episodic_cost"]) for row in mine]
-        np.testing.assert_allclose(curve.episodes.episodic_cost[at], costs, atol=1e-4)
-        assert int(curve.counters.human_data[at]) == int(mine[0]["human_data_usage"])
-    assert int(curve.counters.human_data[-1]) == summary["human_data_usage"]
+    for row in mine["rows"]:
+        played = [other for other in theirs if int(other["step"]) == row["step"]]
+        success = np.mean([int(other["success"]) for other in played])
+        cost = np.mean([float(other["episodic_cost"]) for other in played])
+        assert float(row["success"]) == success
+        assert float(row["episodic_cost"]) == pytest.approx(cost, rel=1e-5)
+        assert row["human_data_usage"] == int(played[0]["human_data_usage"])
+    last = [row for row in theirs if int(row["step"]) == steps[-1]]
+    for row, other in zip(mine["episodes"], last, strict=True):
+        assert {key: str(value) for key, value in row.items()}.items() <= other.items()
+    assert mine["rows"][-1]["human_data_usage"] == summary["human_data_usage"]
 
 
-def test_a_batch_is_its_runs_one_by_one():
+def test_runs_side_by_side_are_the_runs_one_by_one():
     settings = settings_of("ppl")
-    env, lane = lane_of(settings)
     hparams = [
         replace(settings.config, settings.hparams, preference_horizon=horizon, beta=beta)[1]
         for horizon, beta in ((1, 0.1), (4, 0.1), (4, 0.5))
     ]
     keys = jax.vmap(jax.random.key)(np.arange(3, dtype=np.uint32))
-    alone = jax.jit(lane)
-    for side_by_side in (False, True):
-        batch = jax.jit(pure.make_batch(lane, side_by_side))
-        found = batch(keys, pure.stack(hparams), env.held_out_params)
-        for i in range(3):
-            own = alone(jax.random.key(i), hparams[i], env.held_out_params)
-            mine = jax.tree.map(lambda leaf, i=i: leaf[i], found)
-            assert own.counters.human_data.tolist() == mine.counters.human_data.tolist()
+    chunks = plan(settings.config, settings.evaluate_every)
+    alone, batch = programs_of(settings), programs_of(settings, side_by_side=True)
+    together, _ = batch.play(keys, pure.stack(hparams), chunks)
+    for i in range(3):
+        for own, look in zip(alone.play(keys[i], hparams[i], chunks)[0], together, strict=True):
+            mine = look.of(i)
+            assert own.step == mine.step
+            assert own.counters.human_data == mine.counters.human_data
             np.testing.assert_allclose(
                 own.episodes.episodic_return, mine.episodes.episodic_return, atol=1e-3
             )
@@ -105,32 +112,40 @@ def test_a_batch_is_its_runs_one_by_one():
 
 SHARED = """
 import jax, numpy as np
+from experiments.engine.plan import plan
 from ppl_jax import sweep
-from tests.system.test_sweep import lane_of, settings_of
+from tests.system.test_sweep import programs_of, settings_of
 
-assert len(jax.devices()) == 2
 settings = settings_of("ppl")
-env, lane = lane_of(settings)
+programs = programs_of(settings, side_by_side=True)
 keys = jax.vmap(jax.random.key)(np.arange(4, dtype=np.uint32))
-batch = jax.jit(sweep.make_batch(lane, True))
 many = sweep.stack([settings.hparams] * 4)
-apart = batch(*sweep.split((keys, many), jax.devices()), env.held_out_params)
-assert len(apart.diverged.sharding.device_set) == 2
-together = batch(keys, many, env.held_out_params)
-print((np.asarray(apart.counters.human_data) == together.counters.human_data).all())
+apart = programs.init(*sweep.split((keys, many), jax.devices()))
+print(len(apart.diverged.sharding.device_set))
+chunks = plan(settings.config, settings.evaluate_every)
+looks, layers = programs.play(*sweep.split((keys, many), jax.devices()), chunks)
+print(len(layers[0][0].sharding.device_set))
+print(looks[-1].counters.human_data.tolist(), looks[-1].episodes.length.tolist())
 """
 
 
-def test_a_batch_is_shared_out_over_devices(tmp_path):
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
-    found = subprocess.run(
-        [sys.executable, "-c", SHARED],
-        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert found.stdout.strip() == "True", found.stderr
+def test_a_batch_is_shared_out_over_devices():
+    told = []
+    for devices in (1, 2, 4):
+        count = f" --xla_force_host_platform_device_count={devices}"
+        flags = os.environ.get("XLA_FLAGS", "") + count
+        found = subprocess.run(
+            [sys.executable, "-c", SHARED],
+            env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert found.returncode == 0, found.stderr
+        at_start, at_end, results = found.stdout.splitlines()
+        assert (at_start, at_end) == (str(devices), str(devices))
+        told.append(results)
+    assert told[0] == told[1] == told[2]
 
 
 # --- grids ---
@@ -153,12 +168,12 @@ def test_what_is_traced_shares_a_program_and_what_is_static_does_not():
         "min_speed": (3.0, 5.0),
     }
     for name, values in traced.items():
-        runs = plan(command("driving", seeds=3, **{name: values}))
+        runs = planned(command("driving", seeds=3, **{name: values}))
         assert len(runs) == 3 * len(values)
         assert len(grid.groups(runs)) == 1, name
-    runs = plan(command("driving", seeds=2, batch_size=(64, 256), beta=(0.1, 0.3)))
+    runs = planned(command("driving", seeds=2, batch_size=(64, 256), beta=(0.1, 0.3)))
     assert [len(group.runs) for group in grid.groups(runs)] == [4, 4]
-    runs = plan(command("driving", "table_wiping", algorithms=("ppl", "pvp"), seeds=1))
+    runs = planned(command("driving", "table_wiping", algorithms=("ppl", "pvp"), seeds=1))
     assert len(grid.groups(runs)) == 4
 
 
@@ -184,15 +199,15 @@ def test_a_new_value_compiles_nothing():
 
 
 def test_studies_are_the_papers():
-    runs = plan(command("driving", study="horizon"))
+    runs = planned(command("driving", study="horizon"))
     assert {run.settings.config.total_steps for run in runs} == {15_000}
-    assert 10_000 in pure.evaluation_steps(runs[0].settings.config, runs[0].settings.evaluate_every)
+    assert 10_000 in evaluation_steps(runs[0].settings.config, runs[0].settings.evaluate_every)
     assert {run.settings.config.prediction_horizon for run in runs} == {10}
-    runs = plan(command("driving", study="prediction_noise", seeds=1))
+    runs = planned(command("driving", study="prediction_noise", seeds=1))
     noises = sorted({run.settings.hparams.prediction_noise for run in runs})
     assert noises == [0, 0.0625, 0.125, 0.25, 0.5, 1]
     assert {run.settings.algorithm for run in runs} == {"ppl", "pvp"}
-    runs = plan(command("table_wiping", study="horizon_beta", beta=(0.1,), seeds=1))
+    runs = planned(command("table_wiping", study="horizon_beta", beta=(0.1,), seeds=1))
     assert {run.settings.hparams.method.beta for run in runs} == {0.1}  # what is given replaces
     assert len(grid.groups(runs)) == 1
 
@@ -208,7 +223,7 @@ def test_studies_are_the_papers():
 )
 def test_mistakes_are_told_before_anything_is_built(changes, said):
     with pytest.raises(UserError, match=said):
-        plan(command("driving", **changes))
+        planned(command("driving", **changes))
 
 
 # --- the command ---
@@ -468,15 +483,15 @@ def test_a_run_trains_and_is_evaluated_in_its_own_worlds(tmp_path):
 
 
 def test_runs_in_worlds_of_different_ranges_share_a_program():
-    runs = plan(command("gusty", randomise=True, gust=(0.0, 0.5, 2.0), seeds=2))
+    runs = planned(command("gusty", randomise=True, gust=(0.0, 0.5, 2.0), seeds=2))
     (group,) = grid.groups(runs)
     assert len(group.runs) == 6
     assert {run.settings.hparams.world.gust for run in runs} == {0.0, 0.5, 2.0}
     assert runs[2].name == "gusty/ppl/gust=0.5/seed=0"
     with pytest.raises(UserError, match="add --randomise"):
-        plan(command("gusty", gust=(0.0, 0.5)))
+        planned(command("gusty", gust=(0.0, 0.5)))
     with pytest.raises(UserError, match="randomise must be off for 'probe'"):
-        plan(command("probe", randomise=True))
+        planned(command("probe", randomise=True))
 
 
 # --- another axis, and the call for notebooks ---
