@@ -24,7 +24,8 @@ from ppl_jax.gates import gate
 from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.predictors import predictor
 
-SCHEMA = 2  # of config.json; 1 had separate "config" and "hparams" under older names
+# of config.json; 1 had separate "config" and "hparams" under older names, 2 smaller buffers
+SCHEMA = 3
 MAX_SEED = 2**32 - 1
 
 RENAMED = {
@@ -84,6 +85,7 @@ class RunSettings:
             UserError: If it is of a newer version, or holds what no version has.
         """
         schema = schema_of(content)
+        content = with_its_rows(content)
         try:
             given = {name: content[name] for name in _PLAIN}
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
@@ -111,6 +113,16 @@ def program_key(settings: RunSettings) -> tuple[str, ...]:
     owners = settings.hparams.gate, settings.hparams.predictor
     parts = [getattr(static, field.name) for field in dataclasses.fields(static)]
     return tuple(str(part) for part in (*parts, *map(type, owners)))
+
+
+def with_its_rows(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A config.json with the buffers that its run has: before schema 3 no longer than the run."""
+    held = "settings" if "settings" in content else "config"
+    settings = content.get(held, {})
+    if schema_of(content) >= 3 or not {"human_capacity", "total_steps"} <= settings.keys():
+        return content
+    rows = min(settings["human_capacity"], settings["total_steps"])
+    return {**content, held: {**settings, "human_capacity": rows}}
 
 
 def schema_of(content: Mapping[str, Any]) -> int:

@@ -21,6 +21,7 @@ from experiments.engine.settings import (
     one_level,
     refuse_contradictions,
     run_settings,
+    with_its_rows,
     with_values,
 )
 from experiments.options.seeds import parse_seeds
@@ -130,7 +131,7 @@ def test_a_config_of_the_first_version_is_read_under_todays_names():
     assert found.hparams.gate.max_departure == 2.0
     assert RunSettings.from_json(old_config("pvp")).hparams.method.polyak_tau == 0.01
     now = one_level(RunSettings.from_json(old_config("ppl")).as_json())
-    before = one_level(old_config("ppl"))
+    before = one_level(with_its_rows(old_config("ppl")))
     shared = (now.keys() & before.keys()) - {"schema"}
     assert "beta" in shared
     assert {k: now[k] for k in shared} == {k: before[k] for k in shared}
@@ -138,8 +139,8 @@ def test_a_config_of_the_first_version_is_read_under_todays_names():
 
 def test_a_config_of_a_newer_version_or_with_unknown_settings_is_refused():
     content = RunSettings.from_json(old_config("ppl")).as_json()
-    with pytest.raises(UserError, match="schema 3; this version reads up to 2"):
-        RunSettings.from_json(content | {"schema": 3})
+    with pytest.raises(UserError, match="schema 4; this version reads up to 3"):
+        RunSettings.from_json(content | {"schema": 4})
     content["settings"]["beat"] = 1.0
     with pytest.raises(UserError, match="unknown setting 'beat': did you mean 'beta'"):
         RunSettings.from_json(content)
@@ -318,7 +319,19 @@ def before_later_settings(content, schema):
     if schema == 1:
         del content["schema"]
         return content | {"config": kept, "hparams": {}}
-    return content | {"settings": kept}
+    return content | {"schema": schema, "settings": kept}
+
+
+def test_a_run_from_before_schema_3_keeps_its_buffers():
+    """They had no more rows than the run has steps: its checkpoints hold arrays of that size."""
+    now = run_settings("driving", given={"total_steps": 400})
+    assert now.config.human_rows == 10_000
+    before = RunSettings.from_json(now.as_json() | {"schema": 2})
+    assert before.config.human_rows == 400
+    longest = RunSettings.from_json(
+        run_settings("driving", given={"total_steps": 80_000}).as_json() | {"schema": 2}
+    )
+    assert longest.config.human_rows == longest.config.human_capacity == 50_000
 
 
 @pytest.mark.parametrize("schema", [1, 2])
@@ -334,7 +347,7 @@ def test_a_config_from_before_physics_could_be_chosen_is_read_and_continued(sche
     assert parse(resumed).settings == settings
     with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
         parse([*resumed, "--physics", "mjx"])
-    held, asked = one_level(content), one_level(settings.as_json())
+    held, asked = one_level(with_its_rows(content)), one_level(settings.as_json())
     with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
         refuse_contradictions(folder.path, held, asked | {"physics": "mjx"})
 
