@@ -19,6 +19,8 @@ fitted to recorded drives: position error after 1 s 0.024 m median, 0.14 m at th
 from __future__ import annotations
 
 import dataclasses
+import functools
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -77,6 +79,15 @@ def place(pose: jax.Array, velocity: jax.Array, yaw_rate: jax.Array, action: jax
     )
 
 
+class _Moving(NamedTuple):
+    """What a substep changes: the `Ego`'s body, velocity and yaw rate, and m/s^2 forward."""
+
+    body: jax.Array
+    velocity: jax.Array
+    yaw_rate: jax.Array
+    acceleration: jax.Array
+
+
 def _wheel_impulses(
     forward: jax.Array,
     sideways: jax.Array,
@@ -121,10 +132,8 @@ def drive(
     engine = jnp.where((throttle > 0) & ~too_fast, engine_force * throttle * SUBSTEP, 0.0)
     brake = jnp.where(throttle < 0, -throttle * brake_force, COASTING_IMPULSE)
 
-    body, velocity, yaw_rate = ego.body, ego.velocity, ego.yaw_rate
-    acceleration = jnp.zeros(())
-    reported = body
-    for substep in range(SUBSTEPS):
+    def substep(_: jax.Array, car: _Moving) -> _Moving:
+        body, velocity, yaw_rate, acceleration = car
         c, s = jnp.cos(body[2]), jnp.sin(body[2])
         u = c * velocity[0] + s * velocity[1]
         w = -s * velocity[0] + c * velocity[1]
@@ -151,16 +160,20 @@ def drive(
         du = 2 * (front_along * cd - front_across * sd + rear_along) / MASS
         dw = 2 * (front_left + rear_across) / MASS
         yaw_rate = yaw_rate + 2 * (FRONT * front_left - REAR * rear_across) / YAW_INERTIA
-        acceleration = du / SUBSTEP
         velocity = velocity + jnp.stack([c * du - s * dw, s * du + c * dw])
         body = body + SUBSTEP * jnp.append(velocity, yaw_rate)
-        if substep == REPORT_AFTER - 1:
-            reported = body
+        return _Moving(body, velocity, yaw_rate, acceleration=du / SUBSTEP)
+
+    start = _Moving(ego.body, ego.velocity, ego.yaw_rate, acceleration=jnp.zeros(()))
+    # a loop is half the compile time of the substeps written out; an accelerator has them so
+    loop = functools.partial(jax.lax.fori_loop, unroll=jax.default_backend() != "cpu")
+    late = loop(0, REPORT_AFTER, substep, start)
+    now = loop(REPORT_AFTER, SUBSTEPS, substep, late)
     return Ego(
-        pose=reported,
-        body=body,
-        velocity=velocity,
-        yaw_rate=yaw_rate,
+        pose=late.body,
+        body=now.body,
+        velocity=now.velocity,
+        yaw_rate=now.yaw_rate,
         last_pose=ego.pose,
         action=action,
     )
