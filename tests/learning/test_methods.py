@@ -92,7 +92,7 @@ def test_a_vmapped_lane_is_the_run_alone_in_chunks_saved_and_restored(name, tmp_
         jax.vmap(lambda key, rate: fns.train(key, hparams.replace(learning_rate=rate)))
     )(keys, rates)
     pieces = jax.jit(fns.init)(keys[1], hparams.replace(learning_rate=1e-3))
-    chunk = jax.jit(fns.run_chunk, static_argnums=(1, 2))
+    chunk = jax.jit(fns.run_chunk, static_argnums=2)
     for phase, length in phases(config):
         for _ in range(length // 20 or 1):
             pieces, _ = chunk(pieces, min(length, 20) // config.decision_interval, phase)
@@ -124,7 +124,7 @@ def test_nothing_is_learnt_where_nobody_intervenes(name):
 
     fns = make_train(probe, probe.scripted_expert, careless, config)
     start = jax.jit(fns.init)(jax.random.key(0), hparams)
-    end, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 10)
+    end, _ = jax.jit(fns.run_chunk)(start, 10)
     assert int(end.counters.human_data) == 0
     for a, b in pairwise(start.algorithm.learned, end.algorithm.learned):
         np.testing.assert_array_equal(a, b)

@@ -123,7 +123,7 @@ def test_without_an_expert_in_reach_nothing_is_learnt():
     algorithm = fns.algorithm._replace(decide=lambda state, point, hparams: jnp.zeros((), bool))
     fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, TINY)
     start = fns.init(jax.random.key(0), HP)
-    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(start, 4)
+    learner, _ = jax.jit(fns.run_chunk)(start, 4)
     assert int(learner.counters.human_data) == 0
     for a, b in zip(
         jax.tree.leaves(start.algorithm.learned),
@@ -193,7 +193,7 @@ def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
 
 def test_chunks_are_the_whole_run_bit_for_bit():
     _, fns = functions(total_steps=60)
-    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    chunk = jax.jit(fns.run_chunk)
     start = jax.jit(fns.init)(jax.random.key(3), HP)
     halves = start
     for _ in range(4):
@@ -209,7 +209,7 @@ def test_buffers_hold_what_algorithm_1_says():
     probe, fns = functions(total_steps=100)
     hparams = set_to(HP, preference_horizon=2)
     learner = jax.jit(fns.init)(jax.random.key(0), hparams)
-    chunk = jax.jit(fns.run_chunk, static_argnums=1)
+    chunk = jax.jit(fns.run_chunk)
     learner, _ = chunk(learner, 20)
     human, pairs = learner.algorithm.human_buffer, learner.algorithm.preference_buffer
     count = int(human.added)
@@ -236,7 +236,7 @@ def test_a_diverged_run_is_flagged_and_frozen():
     broken = jax.tree.map(lambda x: x.at[...].set(jnp.nan), learner.algorithm.learned.params)
     learned = learner.algorithm.learned.replace(params=broken)
     learner = learner.replace(algorithm=learner.algorithm.replace(learned=learned))
-    learner, _ = jax.jit(fns.run_chunk, static_argnums=1)(learner, 2)
+    learner, _ = jax.jit(fns.run_chunk)(learner, 2)
     assert bool(learner.diverged)
     assert int(learner.counters.steps) == 10
 

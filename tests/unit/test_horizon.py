@@ -94,7 +94,7 @@ def test_it_is_chosen_while_training():
         total_steps=400,
     )
     functions = make_train(Probe(), Probe.scripted_expert, make(), config)
-    run = jax.jit(functions.run_chunk, static_argnums=1)
+    run = jax.jit(functions.run_chunk)
     learner = functions.init(jax.random.key(0), hparams)
     learner, metrics = run(learner, 40)
     assert int(learner.counters.human_data) > 0
