@@ -26,7 +26,6 @@ class Environment:
     max_episode_steps: int
     default_params: Any
     held_out_params: Any
-    sequential_on_cpu: bool = False
 
     if TYPE_CHECKING:  # a protocol's attribute cannot be a cached property to a type checker
         experts: Mapping[str, Expert]

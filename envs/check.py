@@ -63,8 +63,6 @@ def _check_attributes(env: Env) -> None:
     )
     steps = getattr(env, "max_episode_steps", None)
     _require(_is_count(steps), f"max_episode_steps must be an int of 1 or more, got {steps!r}")
-    flag = getattr(env, "sequential_on_cpu", None)
-    _require(isinstance(flag, bool), f"sequential_on_cpu must be True or False, got {flag!r}")
     _require(isinstance(getattr(env, "card", None), EnvCard), "card must be an envs.cards.EnvCard")
     _require(
         env.card.ranges is None or callable(getattr(env, "with_ranges", None)),

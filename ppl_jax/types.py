@@ -183,8 +183,6 @@ class Env(Protocol):
         name: As in results and on the command line.
         spec: Sizes and scaling of observation and action.
         max_episode_steps: Time limit.
-        sequential_on_cpu: On a CPU a batch of environments is no faster than one after another, so
-            an evaluation should skip those whose episode has ended.
         default_params, held_out_params: Traced structs to train on and to evaluate on. Scenarios of
             either are numbered `0 .. scenario_count(params) - 1`.
     """
@@ -192,7 +190,6 @@ class Env(Protocol):
     name: str
     spec: EnvSpec
     max_episode_steps: int
-    sequential_on_cpu: bool
     default_params: PyTree
     held_out_params: PyTree
 

@@ -5,7 +5,7 @@ import pytest
 
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from experiments.engine.evaluate import rows_of
-from ppl_jax.evaluation import evaluate
+from ppl_jax.evaluation import evaluate, make_evaluate
 from tests.helpers import Probe
 
 
@@ -33,13 +33,16 @@ def test_evaluation_is_a_loop_over_scenarios(world):
         np.testing.assert_allclose(found.progress[i], out.progress, atol=1e-3)
 
 
-@pytest.mark.parametrize("sequential_on_cpu", [False, True])
-def test_the_answer_is_known_on_the_probe(sequential_on_cpu):
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_the_answer_is_known_on_the_probe(one_by_one):
     probe = Probe()
-    probe.sequential_on_cpu = sequential_on_cpu
     params = probe.held_out_params
-    good = evaluate(probe, lambda k, s, o, p: jnp.array([0.6]) * o[0], params, jax.random.key(0))
-    bad = evaluate(probe, lambda k, s, o, p: jnp.array([0.6]), params, jax.random.key(0))
+
+    def play(act):
+        return jax.jit(make_evaluate(probe, act, one_by_one=one_by_one))(params, jax.random.key(0))
+
+    good = play(lambda k, s, o, p: jnp.array([0.6]) * o[0])
+    bad = play(lambda k, s, o, p: jnp.array([0.6]))
     assert good.success.tolist() == [True, True]
     assert good.length.tolist() == [20, 20]
     assert bad.success.tolist() == [True, False]
@@ -53,16 +56,13 @@ def test_one_by_one_leaves_out_ended_episodes():
     calls = []
 
     class Counting(Probe):
-        sequential_on_cpu = True
-
         def transition(self, key, state, action, params):
             jax.debug.callback(lambda *_: calls.append(1), state.time)
             return super().transition(key, state, action, params)
 
     probe = Counting()
-    found = evaluate(
-        probe, lambda k, s, o, p: jnp.array([0.6]), probe.held_out_params, jax.random.key(0)
-    )
+    play = jax.jit(make_evaluate(probe, lambda k, s, o, p: jnp.array([0.6]), one_by_one=True))
+    found = play(probe.held_out_params, jax.random.key(0))
     jax.effects_barrier()
     assert len(calls) == int(jnp.sum(found.length)) < 2 * int(jnp.max(found.length))
 

@@ -57,7 +57,6 @@ class ArmTask(Environment):
 
     tool: Tool
     base: np.ndarray
-    sequential_on_cpu = True
 
     def __init__(
         self,
