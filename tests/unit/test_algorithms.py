@@ -13,7 +13,15 @@ from ppl_jax.algorithms import eil, gail, haco, ppl, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
 from ppl_jax.config import HParams
 from ppl_jax.experts import SavedPolicy, act
-from ppl_jax.networks import Network, ensemble_layers, make_critic, make_ensemble, make_policy
+from ppl_jax.networks import (
+    Network,
+    ensemble_layers,
+    layers,
+    make_critic,
+    make_ensemble,
+    make_policy,
+    make_raw,
+)
 from ppl_jax.types import PreferenceBatch
 from tests.helpers import Probe, plain_settings, probe_settings
 
@@ -214,6 +222,31 @@ def test_a_loss_of_a_method_refuses_shapes_that_do_not_fit():
 
 
 # --- networks and data ---
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 3])
+def test_a_network_and_its_gradient_are_those_of_plain_products(outputs):
+    network = make_raw(Probe().spec, (8, 8), outputs)
+    params = network.init(jax.random.key(0))
+    x, target = uniform(B, 3), uniform(B, outputs)
+
+    def plain(params, x):
+        *hidden, (w, b) = layers(params)
+        for kernel, bias in hidden:
+            x = jnp.maximum(x @ kernel + bias, 0)
+        return x @ w + b
+
+    def slope(apply, transform=lambda function: function):
+        return jax.grad(lambda params: jnp.mean((transform(apply)(params, x) - target) ** 2))(
+            params
+        )
+
+    each = functools.partial(jax.vmap, in_axes=(None, 0))
+    for found in (slope(network.apply), slope(network.apply, each)):
+        jax.tree.map(
+            functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), found, slope(plain)
+        )
+    assert network.apply(params, x[0]).shape == (outputs,)
 
 
 def test_an_ensemble_is_one_network_and_its_members_are_independent():
