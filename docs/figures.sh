@@ -19,6 +19,7 @@ for study in horizon_beta prediction_noise expert_noise; do
     figure $results/driving_$study.csv --out $out/driving_$study.png
     figure $results/table_wiping_$study.csv --out $out/wiping_$study.png
 done
+figure $results/bench_growth.csv --out $out/growth.png
 figure envs/pretrained --out $out/experts.png
 if [ $# -eq 2 ]; then
     figure "$1" "$2" --kind steering --scenario 1004 --out $out/steering.png

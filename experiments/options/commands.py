@@ -310,10 +310,12 @@ class Figure:
     other: Positional[tuple[Path, ...]] = ()
     """Kind steering: more of them; kind horizon: results over L, to show beside."""
     kind: (
-        Literal["curves", "axis", "heatmap", "training", "experts", "steering", "horizon"] | None
+        Literal["curves", "axis", "heatmap", "training", "experts", "steering", "horizon", "growth"]
+        | None
     ) = None
     """Learning curves; success over one setting, or two; takeovers and cost in training; training
-    of experts; steering on one map; what L buys and costs (default: what the results have)."""
+    of experts; steering on one map; what L buys and costs; what each size of a run costs (default:
+    what the results have)."""
     column: Literal["success", "progress", "episodic_return", "episodic_cost"] = "success"
     """Column to draw."""
     steps: tuple[int, ...] = ()
@@ -425,7 +427,7 @@ class Recording:
     """Write a Minari data set of this name instead, such as driving/person-v0."""
 
 
-BenchPart = Literal["envs", "training", "experts", "methods", "seeds", "sweep", "physics"]
+BenchPart = Literal["envs", "training", "experts", "methods", "seeds", "sweep", "physics", "growth"]
 
 
 @hide_unset
@@ -437,9 +439,10 @@ class Bench:
     """Repeats of each figure; medians are reported."""
     parts: tuple[BenchPart, ...] = ("envs", "training", "experts", "methods")
     """Parts to measure; seeds (methods, and five seeds of each in one program) and sweep (64 runs
-    against single ones) take long; physics is a table of the arms on each engine."""
+    against single ones) take long; physics is a table of the arms on each engine, growth one of
+    what each size of a run costs."""
     out: Path | None = None
-    """Also write the figures to this JSON file."""
+    """Also write the figures to this JSON file, tables to NAME_physics.csv and NAME_growth.csv."""
 
 
 @hide_unset

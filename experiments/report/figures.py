@@ -30,7 +30,7 @@ from experiments.report.points import (
 from experiments.report.tables import show
 from ppl_jax.statistics import Interval, mean_interval
 
-KINDS = ("curves", "axis", "heatmap", "training", "experts", "steering", "horizon")
+KINDS = ("curves", "axis", "heatmap", "training", "experts", "steering", "horizon", "growth")
 SHARES = ("success", "progress")
 NAMES = {
     "success": "held-out success",
@@ -46,6 +46,14 @@ SETTINGS = {
     "expert_noise": "noise on the expert's action (std)",
     "learning_rate": "learning rate",
     "bc_weight": "weight of the cloning loss",
+}
+GROWTH = {
+    "steps": "steps of the run",
+    "lanes": "runs side by side in one program",
+    "batch_size": "batch size",
+    "human_capacity": "rows of each buffer",
+    "preference_horizon": "preference horizon L, without updates",
+    "prediction_horizon": "prediction horizon H, without updates",
 }
 MARKERS, DASHES = "osD^vP*Xph", ["-", "--", "-.", ":"]
 _OFFLINE = ("bc", "gail")  # learn from demonstrations alone: their steps are not the others'
@@ -86,6 +94,8 @@ def figure(
         return steering([results, *other], scenario, out)
     if kind == "horizon" or (kind is None and _is_measured(results)):
         return what_horizons_cost(results, other, out)
+    if kind == "growth" or (kind is None and _is_growth(results)):
+        return growth(results, out)
     if other:
         raise UserError("more than one path is for --kind steering and horizon alone")
     if kind == "experts" or (kind is None and _cards(results)):
@@ -119,6 +129,11 @@ def _cards(folder: Path) -> list[Path]:
 def _is_measured(path: Path) -> bool:
     """Whether a file is one of `ppl horizon`."""
     return path.is_file() and "predicted_step" in read_csv(path)
+
+
+def _is_growth(path: Path) -> bool:
+    """Whether a file is one of `ppl bench --parts growth`."""
+    return path.is_file() and "cpu_ms_per_step" in read_csv(path)
 
 
 def _varied(points: Sequence[Point]) -> list[str]:
@@ -481,3 +496,38 @@ def _expert_row(panels: Any, path: Path) -> None:
     multiplier.set_ylim(bottom=0)
     for axes in panels:
         _plain(axes)
+
+
+def growth(measured: Path, out: Path) -> None:
+    """What a training step costs over each size of a run; of steps, what the run costs.
+
+    Args:
+        measured: A file of `ppl bench --parts growth`.
+        out: Picture to write.
+
+    Raises:
+        UserError: If the file is another.
+    """
+    if not _is_growth(measured):
+        raise UserError(f"{str(measured)!r} is no file of `ppl bench --parts growth`")
+    frame = read_csv(measured)
+    names = [name for name in GROWTH if (frame["axis"] == name).any()]
+    picture, rows = _canvas(2, -(-len(names) // 2), (11, 6.2))
+    for panel in rows.ravel()[len(names) :]:
+        panel.set_visible(False)
+    for name, axes in zip(names, rows.ravel(), strict=False):
+        here = frame[frame["axis"] == name].astype({"value": float, "cpu_ms": float})
+        whole = name == "steps"
+        cost = here["cpu_ms"] / 1e3 if whole else here["cpu_ms_per_step"].astype(float)
+        axes.plot(here["value"], cost, "o-", color="C0")
+        axes.set(xlabel=GROWTH[name], ylabel="CPU-s" if whole else "CPU-ms per step")
+        axes.set_ylim(0, 1.15 * cost.max())
+        axes.set_xlim(left=0)
+        axes.locator_params(axis="x", nbins=5)
+        _plain(axes)
+    _finish(
+        picture,
+        "PPL in driving, the expert always in control; the fastest of several calls of one run on "
+        "one core, no intervals. Straight lines from the origin: linear; level ones: constant.",
+        out,
+    )

@@ -21,6 +21,7 @@ from envs.driving.make import make_driving
 from envs.registry import make
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
+from experiments.tools.bench_growth import bench_growth, no_update
 from experiments.tools.bench_physics import arms, bench_physics
 from ppl_jax import algorithms
 from ppl_jax.algorithms.ppl import make_ppl
@@ -51,14 +52,22 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     Args:
         repeats: Repeats of each figure; medians are reported.
         parts: Some of "envs", "training", "experts", "methods", "seeds" (methods, and five seeds
-            in one program), "sweep", "physics" (a table of its own, see `bench_physics`).
-        out: JSON file to write (beside it the table of "physics" as CSV), or None.
+            in one program), "sweep"; or "physics", "growth": tables of their own, see
+            `bench_physics` and `bench_growth`.
+        out: JSON file to write (beside it the tables, as NAME_physics.csv and NAME_growth.csv), or
+            None.
     """
+
+    def table(part: str) -> Path | None:
+        return None if out is None else out.with_name(f"{out.stem}_{part}.csv")
+
     if "physics" in parts:
-        bench_physics(arms(), repeats=repeats, out=None if out is None else out.with_suffix(".csv"))
-        parts = tuple(part for part in parts if part != "physics")
-        if not parts:
-            return {}
+        bench_physics(arms(), repeats=repeats, out=table("physics"))
+    if "growth" in parts:
+        bench_growth(repeats=repeats, out=table("growth"))
+    parts = tuple(part for part in parts if part not in ("physics", "growth"))
+    if not parts:
+        return {}
     began = time.perf_counter()
     env = make_driving()
     figures: dict[str, Any] = {"world_built_s": time.perf_counter() - began}
@@ -190,10 +199,6 @@ def arm_figures(
     return figures
 
 
-def _no_update(state: Any, key: jax.Array, hparams: Any) -> Any:
-    return state, {"none": jnp.zeros(())}
-
-
 def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, float]:
     """A method's step: time, share of its updates, and five seeds in one program.
 
@@ -237,7 +242,7 @@ def _method(env: Any, name: str, repeats: int, together: bool) -> dict[str, floa
     jax.config.update("jax_enable_compilation_cache", False)
     try:
         alone, compile_s = program(make, 1)
-        idle, _ = program(lambda spec, config: make(spec, config)._replace(update=_no_update), 1)
+        idle, _ = program(lambda spec, config: make(spec, config)._replace(update=no_update), 1)
         batch, compile_batch_s = program(make, seeds) if together else (0.0, 0.0)
     finally:
         jax.config.update("jax_enable_compilation_cache", cached)
@@ -317,9 +322,9 @@ def _training(env: Any, repeats: int) -> dict[str, float]:
         return make
 
     whole = timed(make_ppl)
-    no_gradient = timed(without(update=_no_update))
+    no_gradient = timed(without(update=no_update))
     no_pairs = timed(
-        without(update=_no_update, store=lambda state, step, hparams: state, predicted_steps=0)
+        without(update=no_update, store=lambda state, step, hparams: state, predicted_steps=0)
     )
     return {
         "train_ms_per_step": whole,

@@ -106,10 +106,10 @@ def _figures(env: Any, start: tuple[Any, jax.Array], batch: int, repeats: int) -
         ).reward
 
     many = state if batch == 1 else jax.tree.map(lambda x: jnp.stack([x] * batch), state)
-    program, compile_s = _compiled(play if batch == 1 else jax.vmap(play), many)
-    cpu, wall = _fastest(lambda: program(many), repeats)
-    ahead_program, _ = _compiled(ahead if batch == 1 else jax.vmap(ahead), many)
-    ahead_cpu, _ = _fastest(lambda: ahead_program(many), repeats)
+    program, compile_s = compiled(play if batch == 1 else jax.vmap(play), many)
+    cpu, wall = fastest(lambda: program(many), repeats)
+    ahead_program, _ = compiled(ahead if batch == 1 else jax.vmap(ahead), many)
+    ahead_cpu, _ = fastest(lambda: ahead_program(many), repeats)
     return {
         "steps_per_cpu_s": round(batch * STEPS / cpu, 1),
         "steps_per_s": round(batch * STEPS / wall, 1),
@@ -118,19 +118,19 @@ def _figures(env: Any, start: tuple[Any, jax.Array], batch: int, repeats: int) -
     }
 
 
-def _compiled(function: Callable[[Any], Any], given: Any) -> tuple[Any, float]:
+def compiled(function: Callable[..., Any], *given: Any) -> tuple[Any, float]:
     """The program, and the CPU-seconds that compiling took, with the cache off."""
     cached = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
     try:
         began = time.process_time()
-        program = jax.jit(function).lower(given).compile()
+        program = jax.jit(function).lower(*given).compile()
         return program, time.process_time() - began
     finally:
         jax.config.update("jax_enable_compilation_cache", cached)
 
 
-def _fastest(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
+def fastest(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
     """Least CPU-seconds and least seconds of a call."""
     jax.block_until_ready(run())
     cpu, wall = [], []

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from experiments.report.figures import figure
 from experiments.tools import bench, doctor
+from experiments.tools.bench_growth import bench_growth
+from tests.helpers import Probe
 
 ROOT = Path(__file__).parent.parent.parent
 LOG = "TF_CPP_MIN_LOG_LEVEL"
@@ -84,6 +87,21 @@ def test_the_extras_that_doctor_knows_are_those_that_can_be_installed():
 
 def test_a_piece_that_is_there_is_ready():
     assert doctor.Piece("x", "reading JSON", ("json",)).line().endswith("reading JSON: ready")
+
+
+def test_growth_is_measured_and_drawn(tmp_path):
+    probe = Probe()
+    probe.name = "driving"  # whose settings it takes
+    sizes = {"steps": (10, 200), "lanes": (2,), "prediction_horizon": (20,), "batch_size": (8,)}
+    path = tmp_path / "growth.csv"
+    rows = bench_growth(repeats=1, out=path, sizes=sizes, env=probe)
+    assert [(row["axis"], row["value"]) for row in rows] == [
+        (axis, value) for axis, values in sizes.items() for value in values
+    ]
+    assert rows[1]["cpu_ms"] > 4 * rows[0]["cpu_ms"]
+    assert [row["updates"] for row in rows] == [True, True, True, False, True]
+    figure(path, out=tmp_path / "growth.png")
+    assert (tmp_path / "growth.png").stat().st_size > 5000
 
 
 def test_the_bench_measures_an_arm():
