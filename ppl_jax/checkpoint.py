@@ -75,9 +75,10 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
         full = "No space left on device" in str(error)
         reason = "no space left on device" if full else str(error).splitlines()[0]
         kept = steps(folder)
+        rest = f"checkpoint {kept[-1]} is whole, continue from it with --resume"
         raise OSError(
             f"cannot write checkpoint {step} in {folder}: {reason}; "
-            + (f"checkpoint {kept[-1]} is whole, continue from it with --resume" if kept else "")
+            + (rest if kept else "nothing of this run was saved")
         ) from error
     for old in steps(folder)[:-KEPT]:
         shutil.rmtree(folder / f"{_PREFIX}{old}", ignore_errors=True)

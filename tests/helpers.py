@@ -1,11 +1,13 @@
 """Shared by tests: probe environments with known answers, tiny settings, programs from outside."""
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple, get_args
 
 import flax.struct
 import jax
@@ -14,8 +16,10 @@ import numpy as np
 
 from envs.base import Environment
 from ppl_jax import algorithms, checkpoint, gates, predictors
-from ppl_jax.config import HParams, TrainConfig, replace, values
-from ppl_jax.training import make_train
+from ppl_jax.config import HParams, TrainConfig, as_arrays, replace, values
+from ppl_jax.evaluation import make_evaluate
+from ppl_jax.experts import SavedPolicy, act
+from ppl_jax.training import Phase, make_train, phases
 from ppl_jax.types import EnvSpec, Outcome
 
 ROOT = Path(__file__).parent.parent
@@ -368,3 +372,78 @@ def functions(name, probe=None, **changes):
     probe = probe or Probe()
     config, hparams = probe_settings(name, **changes)
     return make_train(probe, probe.scripted_expert, algorithms.method(name).make, config), hparams
+
+
+class Programs(NamedTuple):
+    """A method's compiled functions, which runs of any length, seed and learning rate share.
+
+    Attributes:
+        functions, config, hparams: What they are of.
+        init: `init(key, learning rate) -> learner`.
+        chunk: `chunk(learner, blocks, phase) -> learner`.
+    """
+
+    functions: Any
+    config: TrainConfig
+    hparams: HParams
+    init: Any
+    chunk: Any
+
+    def play(self, key, rate=None, total_steps=None):
+        """The learner after a whole run."""
+        config = self.config
+        if total_steps is not None:
+            config = dataclasses.replace(config, total_steps=total_steps)
+        rate = self.hparams.learning_rate if rate is None else rate
+        learner = self.init(key, jnp.broadcast_to(jnp.float32(rate), key.shape))
+        for phase, length in phases(config):
+            learner = self.chunk(learner, length // config.decision_interval, phase)
+        return learner
+
+
+@functools.cache
+def programs(name, world=Probe, *, together=False, **changes):
+    """Of one run, or of several `together` under `vmap`: keys and rates have an axis then."""
+    made, hparams = functions(name, world(), **changes)
+    arrays = as_arrays(hparams)
+
+    def init(key, rate, arrays):
+        return made.init(key, arrays.replace(learning_rate=rate))
+
+    def chunk(learner, blocks, phase):
+        return made.run_chunk(learner, blocks, phase)[0]
+
+    run = functools.partial(functools.partial, chunk)
+    phased = {
+        phase: jax.jit(
+            jax.vmap(run(phase=phase), in_axes=(0, None)) if together else run(phase=phase)
+        )
+        for phase in get_args(Phase)
+    }
+    start = jax.jit(jax.vmap(init, in_axes=(0, 0, None)) if together else init)
+    return Programs(
+        functions=made,
+        config=probe_settings(name, **changes)[0],
+        hparams=hparams,
+        init=lambda key, rate: start(key, rate, arrays),
+        chunk=lambda learner, blocks, phase: phased[phase](learner, jnp.int32(blocks)),
+    )
+
+
+@functools.cache
+def _evaluation(world):
+    env = world()
+    spec = env.spec
+
+    def play(layers, key):
+        policy = SavedPolicy(layers, "relu", "tanh", spec.observation_mean, spec.observation_scale)
+        run = make_evaluate(env, lambda key, state, observation, params: act(policy, observation))
+        return run(env.held_out_params, key)
+
+    return jax.jit(play)
+
+
+def success(world, made, learner):
+    """Share of a probe's held-out scenarios that the learner's policy solves."""
+    layers = made.algorithm.policy(learner.algorithm)
+    return float(np.mean(_evaluation(world)(layers, jax.random.key(0)).success))

@@ -9,38 +9,19 @@ import numpy as np
 import pytest
 
 from ppl_jax import algorithms, checkpoint
-from ppl_jax.evaluation import make_evaluate
-from ppl_jax.experts import SavedPolicy, act
-from ppl_jax.training import make_train, phases
-from tests.helpers import (
-    OWN,
-    Balance,
-    Goal,
-    Probe,
-    functions,
-    pairwise,
-    probe_settings,
-)
+from ppl_jax.config import as_arrays
+from ppl_jax.training import make_train
+from tests.helpers import OWN, Balance, Goal, Probe, pairwise, programs, success
 
 NAMES = algorithms.registered()
 PROBES = {"gail": Goal}  # it has to see the expert succeed
 
 
-def success(probe, fns, learner):
-    spec = probe.spec
-    layers = fns.algorithm.policy(learner.algorithm)
-    policy = SavedPolicy(layers, "relu", "tanh", spec.observation_mean, spec.observation_scale)
-    run = make_evaluate(probe, lambda key, state, observation, params: act(policy, observation))
-    return float(np.mean(jax.jit(run)(probe.held_out_params, jax.random.key(0)).success))
-
-
 @functools.cache
 def trained(name):
     """Two seeds at once."""
-    fns, hparams = functions(name, PROBES.get(name, Probe)())
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    learners, _ = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))(keys, hparams)
-    return fns, hparams, learners
+    both = programs(name, PROBES.get(name, Probe), together=True)
+    return both, both.play(jax.vmap(jax.random.key)(jnp.arange(2)))
 
 
 def lane(tree, i):
@@ -49,16 +30,16 @@ def lane(tree, i):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_probe_world_is_solved(name):
-    fns, _, learners = trained(name)
+    both, learners = trained(name)
     assert not np.any(learners.diverged)
     for i in range(2):
-        assert success(PROBES.get(name, Probe)(), fns, lane(learners, i)) == 1.0
+        assert success(PROBES.get(name, Probe), both.functions, lane(learners, i)) == 1.0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_human_data_is_counted_exactly(name):
-    _, _, learners = trained(name)
-    config, _ = probe_settings(name)
+    both, learners = trained(name)
+    config = both.config
     for i in range(2):
         learner = lane(learners, i)
         human = int(learner.counters.human_data)
@@ -82,22 +63,18 @@ def test_human_data_is_counted_exactly(name):
 @pytest.mark.parametrize("name", algorithms.registered(variants=False))
 def test_a_vmapped_lane_is_the_run_alone_in_chunks_saved_and_restored(name, tmp_path):
     """One lane of two seeds and learning rates, against the same run in pieces on its own."""
-    changes = {"total_steps": 40, "rollout_steps": 20, "batch_size": 8}
-    changes |= {"demonstrations": 20, "offline_updates": 10} if name in OWN else {}
-    fns, hparams = functions(name, **changes)
-    config, _ = probe_settings(name, **changes)
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    rates = jnp.array([3e-3, 1e-3])
-    together, _ = jax.jit(
-        jax.vmap(lambda key, rate: fns.train(key, hparams.replace(learning_rate=rate)))
-    )(keys, rates)
-    pieces = jax.jit(fns.init)(keys[1], hparams.replace(learning_rate=1e-3))
-    chunk = jax.jit(fns.run_chunk, static_argnums=2)
-    for phase, length in phases(config):
-        for _ in range(length // 20 or 1):
-            pieces, _ = chunk(pieces, min(length, 20) // config.decision_interval, phase)
-            checkpoint.save(tmp_path, 1, pieces)
-            pieces = checkpoint.restore(tmp_path, pieces, lambda line: None)[1]
+    world = PROBES.get(name, Probe)
+    alone, both = programs(name, world), programs(name, world, together=True)
+    plan = [("demonstrate", 20), ("fit", 10)] if name in OWN else []
+    plan += {"bc": [], "gail": [("interact", 100)]}.get(name, [("interact", 20)] * 2)
+    keys, rates = jax.vmap(jax.random.key)(jnp.arange(2)), jnp.array([3e-3, 1e-3])
+    together, pieces = both.init(keys, rates), alone.init(keys[1], rates[1])
+    for phase, length in plan:
+        blocks = length // alone.config.decision_interval
+        together = both.chunk(together, blocks, phase)
+        pieces = alone.chunk(pieces, blocks, phase)
+        checkpoint.save(tmp_path, 1, pieces)
+        pieces = checkpoint.restore(tmp_path, pieces, lambda line: None)[1]
     for a, b in pairwise(pieces, lane(together, 1)):
         if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             # where a gradient vanishes, Adam makes whole steps of what rounding leaves of it
@@ -114,17 +91,16 @@ WATCHED = [
 
 @pytest.mark.parametrize("name", WATCHED)
 def test_nothing_is_learnt_where_nobody_intervenes(name):
-    probe = Probe()
-    config, hparams = probe_settings(name, min_speed=0.0, total_steps=100)
+    world, alone = PROBES.get(name, Probe)(), programs(name, PROBES.get(name, Probe))
     watched = algorithms.method(name).make
 
     def careless(spec, config):
         never = lambda state, point, hparams: jnp.zeros((), bool)  # noqa: E731
         return watched(spec, config)._replace(decide=never)
 
-    fns = make_train(probe, probe.scripted_expert, careless, config)
-    start = jax.jit(fns.init)(jax.random.key(0), hparams)
-    end, _ = jax.jit(fns.run_chunk)(start, 10)
+    unwatched = make_train(world, world.scripted_expert, careless, alone.config)
+    start = alone.init(jax.random.key(0), alone.hparams.learning_rate)
+    end, _ = jax.jit(unwatched.run_chunk)(start, 10)
     assert int(end.counters.human_data) == 0
     for a, b in pairwise(start.algorithm.learned, end.algorithm.learned):
         np.testing.assert_array_equal(a, b)
@@ -144,9 +120,9 @@ def test_a_variant_fails_where_theory_says_so(case):
     changes = dict(changes)
     if name == "ensemble_dagger":  # demonstrations of one kind of episode only
         changes |= {"demonstrations": 5, "offline_updates": 20}
-    fns, hparams = functions(name, **changes)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    assert success(Probe(), fns, learner) < 1.0
+    variant = programs(name, **changes)
+    learner = variant.play(jax.random.key(0))
+    assert success(Probe, variant.functions, learner) < 1.0
     if name == "ensemble_dagger":
         assert int(learner.counters.human_data) == 5  # it never asked
 
@@ -158,12 +134,10 @@ def test_demonstrations_do_not_teach_to_come_back_and_interventions_do():
     """
     results = {}
     for name in ("bc", "hg_dagger"):
-        probe = Balance()
-        fns, hparams = functions(name, probe)
-        train = jax.jit(jax.vmap(fns.train, in_axes=(0, None)))
-        learners, _ = train(jax.random.split(jax.random.key(0), 20), hparams)
-        each = [jax.tree.map(lambda leaf, i=i: leaf[i], learners) for i in range(20)]
-        results[name] = np.mean([success(probe, fns, learner) for learner in each])
+        many = programs(name, Balance, together=True)
+        learners = many.play(jax.random.split(jax.random.key(0), 20))
+        each = [success(Balance, many.functions, lane(learners, i)) for i in range(20)]
+        results[name] = np.mean(each)
     assert results["bc"] <= 0.8
     assert results["hg_dagger"] >= 0.95
 
@@ -171,18 +145,17 @@ def test_demonstrations_do_not_teach_to_come_back_and_interventions_do():
 @pytest.mark.parametrize(("correction", "solves"), [(1.0, True), (0.0, False)])
 def test_a_reward_that_is_never_negative_makes_gail_loiter(correction, solves):
     """Where success ends the episode, -log(1 - D) >= 0 pays for not getting there."""
-    probe = Goal()
-    fns, hparams = functions("gail", probe, survival_correction=correction)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
-    assert (success(probe, fns, learner) > 0.9) is solves
+    alone = programs("gail", Goal, survival_correction=correction)
+    learner = alone.play(jax.random.key(0))
+    assert (success(Goal, alone.functions, learner) > 0.9) is solves
 
 
 # --- the data of a run ---
 
 
 def test_ensembles_have_data_sets_of_their_own():
-    fns, hparams = functions("ensemble_dagger")
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
+    alone = programs("ensemble_dagger")
+    learner = alone.play(jax.random.key(0))
     copies = np.asarray(learner.algorithm.human.copies)  # [C, K]
     assert copies.mean() == pytest.approx(1.0, abs=0.1)
     assert copies.var() == pytest.approx(1.0, abs=0.15)  # Poisson
@@ -191,10 +164,10 @@ def test_ensembles_have_data_sets_of_their_own():
     state = learner.algorithm
     human = dataclasses.replace(state.human, copies=0.0 * state.human.copies.at[:, 1].set(0.0))
     human = dataclasses.replace(human, copies=human.copies.at[:, 0].set(1.0))
-    fresh = fns.algorithm.init(jax.random.key(1))
+    fresh = alone.init(jax.random.key(1), alone.hparams.learning_rate).algorithm
     before = fresh.learned.params
-    after, _ = fns.algorithm.update(
-        dataclasses.replace(fresh, human=human), jax.random.key(2), hparams
+    after, _ = jax.jit(alone.functions.algorithm.update)(
+        dataclasses.replace(fresh, human=human), jax.random.key(2), as_arrays(alone.hparams)
     )
     for old, new in zip(
         jax.tree.leaves(before), jax.tree.leaves(after.learned.params), strict=True
@@ -212,8 +185,7 @@ def next_observation(observation, action):
 
 @pytest.mark.parametrize("name", ["pvp", "haco", "thrifty_dagger"])
 def test_next_observations_are_right_at_every_end_of_a_segment(name):
-    fns, hparams = functions(name, total_steps=400)
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
+    learner = programs(name).play(jax.random.key(0), total_steps=400)
     if name == "thrifty_dagger":
         held = [learner.algorithm.steps]
     else:
@@ -244,8 +216,7 @@ def test_next_observations_are_right_at_every_end_of_a_segment(name):
 
 @pytest.mark.parametrize("which", ["preferred", "rejected"])
 def test_random_pairs_are_drawn_once_and_change_nothing_else(which):
-    fns, hparams = functions("ppl", total_steps=200, **{which: "random"})
-    learner, _ = jax.jit(fns.train)(jax.random.key(0), hparams)
+    learner = programs("ppl", **{which: "random"}).play(jax.random.key(0), total_steps=200)
     state = learner.algorithm
     count = int(state.preference_buffer.added)
     assert 20 < count < 2000

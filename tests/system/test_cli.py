@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from ppl_jax import checkpoint
+from tests.helpers import ROOT, call, program
 
-ROOT = Path(__file__).parent.parent.parent
 TINY = ["--total-steps", "60", "--batch-size", "16", "--evaluate-every", "20"]
 
 
@@ -126,9 +126,17 @@ def files_of(out):
     return learner
 
 
+@pytest.fixture(scope="module")
+def probe_run(tmp_path_factory):
+    """The program that knows the probe, where saving and resuming cost little, and its run."""
+    folder = tmp_path_factory.mktemp("probe")
+    program(folder, "train", "probe", *TINY, "--out", folder / "run")
+    return folder / "own.py", folder / "run"
+
+
 @pytest.mark.parametrize("moment", ["before the first checkpoint", "while saving", "between"])
-def test_a_killed_run_resumes_bit_for_bit(run, tmp_path, moment):
-    whole, _ = run
+def test_a_killed_run_resumes_bit_for_bit(probe_run, tmp_path, moment):
+    script, whole = probe_run
     out = tmp_path / "killed"
     folder = out / "checkpoints"
     seen = {
@@ -137,8 +145,8 @@ def test_a_killed_run_resumes_bit_for_bit(run, tmp_path, moment):
         "between": lambda: (folder / "step_20" / "checksum.json").exists(),
     }[moment]
     process = subprocess.Popen(
-        command("train", "driving", *TINY, "--out", out),
-        cwd=ROOT,
+        [sys.executable, script, "train", "probe", *TINY, "--out", out],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -148,7 +156,7 @@ def test_a_killed_run_resumes_bit_for_bit(run, tmp_path, moment):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (out / "summary.json").exists()
-    ppl("train", "driving", *TINY, "--out", out, "--resume")
+    call(script, "train", "probe", *TINY, "--out", out, "--resume")
     assert files_of(out) == files_of(whole)
 
 
@@ -241,16 +249,17 @@ def test_an_unwritable_folder_is_one_line():
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(tmp_path):
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(probe_run, tmp_path):
+    script, _ = probe_run
     small = tmp_path / "small"
     small.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(small)], capture_output=True
+        ["mount", "-t", "tmpfs", "-o", "size=1500k", "tmpfs", str(small)], capture_output=True
     )
     if mounted.returncode:
         pytest.skip("a small disk cannot be mounted here (needs root)")
     try:
-        done = ppl("train", "driving", *TINY, "--out", small / "run", code=1)
+        done = call(script, "train", "probe", *TINY, "--out", small / "run", code=1)
         errors = [
             line
             for line in done.stderr.splitlines()
@@ -261,7 +270,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(tmp_path):
         assert "continue from it with --resume" in errors[0]
         assert checkpoint.steps(small / "run" / "checkpoints")
         subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
-        ppl("train", "driving", *TINY, "--out", small / "run", "--resume")
+        call(script, "train", "probe", *TINY, "--out", small / "run", "--resume")
     finally:
         subprocess.run(["umount", str(small)], check=True)
 
