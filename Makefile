@@ -14,10 +14,10 @@ demo: $(VENV)/.installed
 	$(BIN)/ppl train driving
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-unit test-learning test-worlds test-system test-browser: test-%: $(VENV)/.installed
-	$(BIN)/python -m pytest -n 2 tests/$*
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$*
 
 check: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -43,6 +43,14 @@ def run(tmp_path_factory):
     return out, done
 
 
+@pytest.fixture(scope="module")
+def probe_run(tmp_path_factory):
+    """The program that knows the probe, where saving and resuming cost little, and its run."""
+    folder = tmp_path_factory.mktemp("probe")
+    program(folder, "train", "probe", *TINY, "--out", folder / "run")
+    return folder / "own.py", folder / "run"
+
+
 def test_a_run_prints_its_table_and_leaves_a_run_folder(run):
     out, done = run
     assert "success" in done.stdout
@@ -106,10 +114,10 @@ def test_an_exported_policy_runs_in_plain_numpy_and_drives_the_same(run, tmp_pat
     assert [row.split(",")[1:7] for row in rows] == last
 
 
-def test_a_saved_policy_can_be_the_expert(run, tmp_path):
-    out, _ = run
+def test_a_saved_policy_can_be_the_expert(probe_run, tmp_path):
+    script, out = probe_run
     words = ["--expert", out / "policy.npz", "--expert-noise", "0.1", "--out", tmp_path / "b"]
-    ppl("train", "driving", "--total-steps", "20", "--batch-size", "16", *words)
+    call(script, "train", "probe", "--total-steps", "20", "--batch-size", "16", *words)
 
 
 def files_of(out):
@@ -124,14 +132,6 @@ def files_of(out):
     with np.load(out / "policy.npz") as z:
         learner["policy"] = {name: z[name].tobytes() for name in z.files}
     return learner
-
-
-@pytest.fixture(scope="module")
-def probe_run(tmp_path_factory):
-    """The program that knows the probe, where saving and resuming cost little, and its run."""
-    folder = tmp_path_factory.mktemp("probe")
-    program(folder, "train", "probe", *TINY, "--out", folder / "run")
-    return folder / "own.py", folder / "run"
 
 
 @pytest.mark.parametrize("moment", ["before the first checkpoint", "while saving", "between"])
@@ -160,8 +160,8 @@ def test_a_killed_run_resumes_bit_for_bit(probe_run, tmp_path, moment):
     assert files_of(out) == files_of(whole)
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(run, tmp_path):
-    whole, _ = run
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(probe_run, tmp_path):
+    script, whole = probe_run
     out = tmp_path / "damaged"
     shutil.copytree(whole, out)
     newest = out / "checkpoints" / "step_60"
@@ -170,7 +170,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(run, tmp_path)
     middle = len(data) // 2
     data[middle : middle + 64] = bytes(64 * [85])
     victim.write_bytes(bytes(data))
-    done = ppl("train", "driving", *TINY, "--out", out, "--resume")
+    done = call(script, "train", "probe", *TINY, "--out", out, "--resume")
     assert "step_60 is damaged" in done.stderr
     assert files_of(out) == files_of(whole)
 
@@ -232,12 +232,12 @@ def test_bad_policies_are_refused(run, tmp_path):
     assert "maps 100 observations to 2 actions; this environment has 259 and 2" in done.stderr
 
 
-def test_another_config_or_an_occupied_folder_is_refused(run):
-    out, _ = run
+def test_another_config_or_an_occupied_folder_is_refused(probe_run):
+    script, out = probe_run
     before = files_of(out)
-    done = ppl("train", "driving", *TINY, "--out", out, code=2)
+    done = call(script, "train", "probe", *TINY, "--out", out, code=2)
     assert "already holds a run" in done.stderr
-    done = ppl("train", "driving", *TINY, "--seed", "9", "--out", out, "--resume", code=2)
+    done = call(script, "train", "probe", *TINY, "--seed", "9", "--out", out, "--resume", code=2)
     assert "its seed is 0, asked for 9" in done.stderr
     assert files_of(out) == before
 
