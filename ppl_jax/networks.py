@@ -29,7 +29,7 @@ def _by_column(x: jax.Array, w: jax.Array, *_: Any, **__: Any) -> jax.Array:
     """`x @ w`, a column of `w` at a time.
 
     The gradient of a product with one or two columns is two products that XLA's CPU library does at
-    2 GFLOP/s; with both columns of driving's actions they were an eighth of a training step.
+    2 GFLOP/s; with both columns of driving's actions they were a sixth of a training step.
     """
     return jnp.stack([x @ column for column in w.T], -1)
 
