@@ -132,10 +132,10 @@ def preference_pairs(
 ) -> jax.Array:
     """The limit of D_pref: the joint distribution of (state, a+, a-), [S, A, A].
 
-        rho(s', a+, a-) = 1/L sum_{i=1..L} sum_s taken_over(s) h(a+|s) n(a-|s) P_{a-}^i(s, s')
+        rho(s', a+, a-) = 1/(L+1) sum_{i=0..L} sum_s taken_over(s) h(a+|s) n(a-|s) P_{a-}^i(s, s')
 
-    Both actions are drawn where the expert takes over; the state is predicted from there by i steps
-    with the novice's action held (section 4.1).
+    Both actions are drawn where the expert takes over; the state is that one (i = 0) or is
+    predicted from there by i steps with the novice's action held (Algorithm 1, section 4.1).
 
     Args:
         mdp: The environment; it is its own predictor.
@@ -154,7 +154,7 @@ def preference_pairs(
         return at, at * (i < preference_horizon)
 
     _, reached = jax.lax.scan(step, begun, jnp.arange(max_horizon))
-    return jnp.transpose(jnp.sum(reached, 0) / preference_horizon, (2, 1, 0))
+    return jnp.transpose((begun + jnp.sum(reached, 0)) / (preference_horizon + 1), (2, 1, 0))
 
 
 def preference_loss(pairs: jax.Array, policy: jax.Array, beta: jax.Array | float) -> jax.Array:

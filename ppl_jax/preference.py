@@ -1,8 +1,11 @@
-"""Preference pairs over the first L predicted states.
+"""Preference pairs over the present and the first L predicted states.
 
 For an intervention at s_t with novice action a_n and expert action a_h, the predictor holds a_n
-and reaches s~_1 .. s~_H; each of the first L gives the pair (s~_i, a+ = a_h, a- = a_n) (Algorithm 1
-of the paper). L is traced: pairs past it are masked, so sweeping it compiles nothing.
+and reaches s~_{t+1} .. s~_{t+H}. Algorithm 1 of the paper adds the L + 1 pairs
+
+    (s~, a+ = a_h, a- = a_n)   for s~ in (s_t, s~_{t+1}, ..., s~_{t+L})
+
+L is traced: pairs past it are masked, so sweeping it compiles nothing.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import jax.numpy as jnp
 from ppl_jax.checks import check_name
 from ppl_jax.types import Interaction, PreferenceBatch
 
-PAIR_STATES = ("predicted", "shifted")
+PAIR_STATES = ("predicted", "future", "shifted")
 
 
 def preference_pairs(
@@ -25,11 +28,12 @@ def preference_pairs(
     Args:
         step: With `predicted` of M >= L steps.
         preference_horizon: L, traced.
-        pair_states: "predicted" (the paper), or "shifted" (the released code: the preferred
-            action at state k, the rejected one at state k + 1, for k = 0..L-1).
+        pair_states: "predicted" (the paper: s_t and s~_{t+1} .. s~_{t+L}), "future" (the same
+            without s_t), or "shifted" (the released code: the preferred action at state k, the
+            rejected one at state k + 1, for k = 0..L-1).
 
     Returns:
-        [M] pairs and their [M] mask.
+        Pairs and their mask; M of them, with s_t M + 1.
 
     Raises:
         ValueError: If `pair_states` is unknown.
@@ -43,14 +47,17 @@ def preference_pairs(
         [step.expert_action, step.novice_action], custom_message="expert_action and novice_action"
     )
     mask = step.takeover & predicted.valid & (jnp.arange(count) < preference_horizon)
+    observation, rejected = predicted.observation, None
+    if pair_states != "future":
+        observation = jnp.concatenate([step.observation[None], observation])
+    if pair_states == "predicted":
+        mask = jnp.concatenate([jnp.asarray(step.takeover)[None], mask])
+    elif pair_states == "shifted":
+        observation, rejected = observation[:-1], predicted.observation
 
     def repeat(action: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(action, (count, *action.shape))
+        return jnp.broadcast_to(action, (mask.shape[0], *action.shape))
 
-    observation, rejected = predicted.observation, None
-    if pair_states == "shifted":
-        rejected = predicted.observation
-        observation = jnp.concatenate([step.observation[None], rejected[:-1]])
     pairs = PreferenceBatch(
         observation=observation,
         preferred_action=repeat(step.expert_action),

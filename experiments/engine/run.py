@@ -37,7 +37,6 @@ from experiments.engine.settings import (
     check,
     one_level,
     refuse_contradictions,
-    with_its_rows,
 )
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.experts import SavedPolicy
@@ -173,7 +172,7 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
             before = folder.config()
         except ValueError as error:
             raise UserError(str(error)) from error
-        held = one_level(with_its_rows(before))
+        held = one_level(before)
         asked = one_level(json.loads(json.dumps(content)))
         refuse_contradictions(folder.path, held, asked)
         return

@@ -24,8 +24,9 @@ from ppl_jax.gates import gate
 from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.predictors import predictor
 
-# of config.json; 1 had separate "config" and "hparams" under older names, 2 smaller buffers
-SCHEMA = 3
+# of config.json; 1 had separate "config" and "hparams" under older names, 2 smaller buffers, 3 no
+# pairs at s_t where `pair_states` is "predicted"
+SCHEMA = 4
 MAX_SEED = 2**32 - 1
 
 RENAMED = {
@@ -85,7 +86,7 @@ class RunSettings:
             UserError: If it is of a newer version, or holds what no version has.
         """
         schema = schema_of(content)
-        content = with_its_rows(content)
+        content = as_it_was(content)
         try:
             given = {name: content[name] for name in _PLAIN}
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
@@ -115,14 +116,18 @@ def program_key(settings: RunSettings) -> tuple[str, ...]:
     return tuple(str(part) for part in (*parts, *map(type, owners)))
 
 
-def with_its_rows(content: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A config.json with the buffers that its run has: before schema 3 no longer than the run."""
-    held = "settings" if "settings" in content else "config"
-    settings = content.get(held, {})
-    if schema_of(content) >= 3 or not {"human_capacity", "total_steps"} <= settings.keys():
-        return content
-    rows = min(settings["human_capacity"], settings["total_steps"])
-    return {**content, held: {**settings, "human_capacity": rows}}
+def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A config.json of an older version with what its run does, in today's words.
+
+    Before schema 3 no buffer was longer than the run. Before schema 4 there were no pairs at s_t.
+    """
+    schema, held = schema_of(content), "settings" if "settings" in content else "config"
+    settings = dict(content.get(held, {}))
+    if schema < 3 and {"human_capacity", "total_steps"} <= settings.keys():
+        settings["human_capacity"] = min(settings["human_capacity"], settings["total_steps"])
+    if schema < 4 and settings.get("pair_states") == "predicted":
+        settings["pair_states"] = "future"
+    return {**content, held: settings} if held in content else content
 
 
 def schema_of(content: Mapping[str, Any]) -> int:
@@ -175,6 +180,7 @@ def with_values(env: str, algorithm: str, given: Mapping[str, Any]) -> tuple[Tra
 
 def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
     """A run's config.json, of any version, as one level of names."""
+    content = as_it_was(content)
     of_a_method = content.get("algorithm") in algorithms.registered()
     if of_a_method and content.get("schema", 1) == 1:
         found = {**content, "settings": _of_schema_1(content)}

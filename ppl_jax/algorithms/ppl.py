@@ -44,10 +44,11 @@ class PPLConfig:
     preference_capacity: int = setting(
         50_000, "Rows of the buffer of preference pairs; the oldest go first.", low=1
     )
-    pair_states: Literal["predicted", "shifted"] = setting(
+    pair_states: Literal["predicted", "future", "shifted"] = setting(
         "predicted",
-        "Pairs at predicted states 1..L, or one state apart as in the released code.",
-        choices=("predicted", "shifted"),
+        "Pairs at s_t and predicted states 1..L (the paper), at the predicted ones alone, or one "
+        "state apart as in the released code.",
+        choices=("predicted", "future", "shifted"),
     )
     objective: Literal["cpo", "dpo", "ipo", "slic_hf", "imitation"] = setting(
         "cpo",
@@ -89,7 +90,8 @@ class PPLHParams:
 
     preference_horizon: jax.Array | float = setting(
         4,
-        "L: predicted states that get a preference pair; auto chooses it while training.",
+        "L: predicted states that get a preference pair, besides the present one; auto chooses it "
+        "while training.",
         low=1,
         choices=("auto",),
         common=True,

@@ -94,9 +94,9 @@ def test_the_parts_against_loops():
         for good in range(A):
             for bad in range(A):
                 at = np.eye(S)[s]
-                for _ in range(3):
+                for _ in range(1 + 3):  # the present state and L = 3 predicted ones
+                    joint[:, good, bad] += begun[s] * h[s, good] * n[s, bad] * at / 4
                     at = at @ p[:, bad]
-                    joint[:, good, bad] += begun[s] * h[s, good] * n[s, bad] * at / 3
     np.testing.assert_allclose(pairs, joint, atol=1e-6)
     states = joint.sum((1, 2))
     wrong = sum(

@@ -68,20 +68,21 @@ def interaction(takeover, predicted):
 
 
 @pytest.mark.parametrize("takeover", [False, True])
-@pytest.mark.parametrize("horizon", [1, 3, M])
-@pytest.mark.parametrize("valid", [1, 4, M])
-@pytest.mark.parametrize("pair_states", ["predicted", "shifted"])
+@pytest.mark.parametrize("horizon", [1, 4, M])
+@pytest.mark.parametrize("valid", [1, 3, M])
+@pytest.mark.parametrize("pair_states", ["predicted", "future", "shifted"])
 def test_pairs_are_the_loop_of_algorithm_1(takeover, horizon, valid, pair_states):
-    step = interaction(takeover, trajectory(valid))
+    """For L = 1, 4 and H, where the prediction or the episode ends within it or does not."""
+    step = interaction(takeover, trajectory(valid, ended=[valid - 1] if valid < M else []))
     pairs, mask = preference_pairs(step, jnp.float32(horizon), pair_states)
-    expected = []
     states = [np.full(O, -1.0), *np.asarray(step.predicted.observation)]
-    for i in range(1, M + 1):
-        if takeover and i <= horizon and i <= valid:
-            if pair_states == "predicted":
-                expected.append((states[i], None))
-            else:
-                expected.append((states[i - 1], states[i]))
+    last = min(horizon, valid)
+    expected = {
+        "predicted": [(state, None) for state in states[: last + 1]],
+        "future": [(state, None) for state in states[1 : last + 1]],
+        "shifted": [(states[k], states[k + 1]) for k in range(last)],
+    }[pair_states]
+    expected = expected if takeover else []
     got = np.flatnonzero(np.asarray(mask))
     assert len(got) == len(expected)
     for row, (state, rejected) in zip(got, expected, strict=True):
@@ -96,7 +97,7 @@ def test_changing_the_horizon_compiles_nothing():
     step = interaction(True, trajectory())
     run = jax.jit(preference_pairs, static_argnums=2)
     for horizon in (1.0, 2.0, 5.0):
-        assert int(run(step, jnp.float32(horizon), "predicted")[1].sum()) == horizon
+        assert int(run(step, jnp.float32(horizon), "predicted")[1].sum()) == 1 + horizon
     assert run._cache_size() == 1
 
 
@@ -154,7 +155,7 @@ def test_the_gate_that_compares_with_the_expert(case, shift, expected):
 
 def test_unknown_states_and_shapes_that_do_not_fit_are_refused():
     step = interaction(True, trajectory())
-    with pytest.raises(ValueError, match="one of predicted, shifted, got 'shift': did you mean"):
+    with pytest.raises(ValueError, match="one of predicted, future, shifted, got 'shift': did you mean"):
         preference_pairs(step, 3, "shift")
     for wrong in (
         {"observation": jnp.zeros(O + 1)},

@@ -21,7 +21,6 @@ from experiments.engine.settings import (
     one_level,
     refuse_contradictions,
     run_settings,
-    with_its_rows,
     with_values,
 )
 from experiments.options.seeds import parse_seeds
@@ -131,7 +130,7 @@ def test_a_config_of_the_first_version_is_read_under_todays_names():
     assert found.hparams.gate.max_departure == 2.0
     assert RunSettings.from_json(old_config("pvp")).hparams.method.polyak_tau == 0.01
     now = one_level(RunSettings.from_json(old_config("ppl")).as_json())
-    before = one_level(with_its_rows(old_config("ppl")))
+    before = one_level(old_config("ppl"))
     shared = (now.keys() & before.keys()) - {"schema"}
     assert "beta" in shared
     assert {k: now[k] for k in shared} == {k: before[k] for k in shared}
@@ -139,8 +138,8 @@ def test_a_config_of_the_first_version_is_read_under_todays_names():
 
 def test_a_config_of_a_newer_version_or_with_unknown_settings_is_refused():
     content = RunSettings.from_json(old_config("ppl")).as_json()
-    with pytest.raises(UserError, match="schema 4; this version reads up to 3"):
-        RunSettings.from_json(content | {"schema": 4})
+    with pytest.raises(UserError, match="schema 5; this version reads up to 4"):
+        RunSettings.from_json(content | {"schema": 5})
     content["settings"]["beat"] = 1.0
     with pytest.raises(UserError, match="unknown setting 'beat': did you mean 'beta'"):
         RunSettings.from_json(content)
@@ -334,6 +333,16 @@ def test_a_run_from_before_schema_3_keeps_its_buffers():
     assert longest.config.human_rows == longest.config.human_capacity == 50_000
 
 
+def test_a_run_from_before_schema_4_has_no_pairs_at_the_present_state():
+    now = run_settings("driving")
+    assert now.config.method.pair_states == "predicted"
+    old = now.as_json() | {"schema": 3}
+    assert RunSettings.from_json(old).config.method.pair_states == "future"
+    assert one_level(old)["pair_states"] == "future"
+    reference = run_settings("driving", preset="reference").as_json() | {"schema": 3}
+    assert RunSettings.from_json(reference).config.method.pair_states == "shifted"
+
+
 @pytest.mark.parametrize("schema", [1, 2])
 def test_a_config_from_before_physics_could_be_chosen_is_read_and_continued(schema, tmp_path):
     content = before_later_settings(run_settings("table_wiping").as_json(), schema)
@@ -347,7 +356,7 @@ def test_a_config_from_before_physics_could_be_chosen_is_read_and_continued(sche
     assert parse(resumed).settings == settings
     with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
         parse([*resumed, "--physics", "mjx"])
-    held, asked = one_level(with_its_rows(content)), one_level(settings.as_json())
+    held, asked = one_level(content), one_level(settings.as_json())
     with pytest.raises(UserError, match="its physics is 'auto', asked for 'mjx'"):
         refuse_contradictions(folder.path, held, asked | {"physics": "mjx"})
 
