@@ -155,7 +155,9 @@ def test_the_gate_that_compares_with_the_expert(case, shift, expected):
 
 def test_unknown_states_and_shapes_that_do_not_fit_are_refused():
     step = interaction(True, trajectory())
-    with pytest.raises(ValueError, match="one of predicted, future, shifted, got 'shift': did you mean"):
+    with pytest.raises(
+        ValueError, match="one of predicted, future, shifted, got 'shift': did you mean"
+    ):
         preference_pairs(step, 3, "shift")
     for wrong in (
         {"observation": jnp.zeros(O + 1)},
