@@ -74,7 +74,7 @@ def make_evaluate(
             alive, key, state, observation, action = lane
             nothing = jax.tree.map(
                 lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-                jax.eval_shape(one, key, state, action)[2],
+                jax.eval_shape(env.transition, key, state, action, params)[1],
             )
             return jax.lax.cond(
                 alive,

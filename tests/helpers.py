@@ -413,13 +413,11 @@ def programs(name, world=Probe, *, together=False, **changes):
     def chunk(learner, blocks, phase):
         return made.run_chunk(learner, blocks, phase)[0]
 
-    run = functools.partial(functools.partial, chunk)
-    phased = {
-        phase: jax.jit(
-            jax.vmap(run(phase=phase), in_axes=(0, None)) if together else run(phase=phase)
-        )
-        for phase in get_args(Phase)
-    }
+    def of(phase):
+        run = functools.partial(chunk, phase=phase)
+        return jax.jit(jax.vmap(run, in_axes=(0, None)) if together else run)
+
+    phased = {phase: of(phase) for phase in get_args(Phase)}
     start = jax.jit(jax.vmap(init, in_axes=(0, 0, None)) if together else init)
     return Programs(
         functions=made,

@@ -92,12 +92,12 @@ def figure(
         from experiments.report.steering import steering
 
         return steering([results, *other], scenario, out)
-    if kind == "horizon" or (kind is None and _is_measured(results)):
+    if kind == "horizon" or (kind is None and _is_measured(results, "horizon")):
         return what_horizons_cost(results, other, out)
-    if kind == "growth" or (kind is None and _is_growth(results)):
-        return growth(results, out)
     if other:
         raise UserError("more than one path is for --kind steering and horizon alone")
+    if kind == "growth" or (kind is None and _is_measured(results, "growth")):
+        return growth(results, out)
     if kind == "experts" or (kind is None and _cards(results)):
         return expert_curves(results, out)
     points = read_points(results)
@@ -126,14 +126,27 @@ def _cards(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*.csv") if path.with_suffix(".json").is_file())
 
 
-def _is_measured(path: Path) -> bool:
-    """Whether a file is one of `ppl horizon`."""
-    return path.is_file() and "predicted_step" in read_csv(path)
+# kinds of figures that no run is in: the command that measures them, and a column of its file alone
+_MEASURED = {
+    "horizon": ("ppl horizon", "predicted_step"),
+    "growth": ("ppl bench --parts growth", "cpu_ms_per_step"),
+}
 
 
-def _is_growth(path: Path) -> bool:
-    """Whether a file is one of `ppl bench --parts growth`."""
-    return path.is_file() and "cpu_ms_per_step" in read_csv(path)
+def _is_measured(path: Path, kind: str) -> bool:
+    """Whether a file is one of the command behind such a kind."""
+    return path.is_file() and _MEASURED[kind][1] in read_csv(path)
+
+
+def _measured(path: Path, kind: str) -> Frame:
+    """What such a file holds.
+
+    Raises:
+        UserError: If the file is another.
+    """
+    if not _is_measured(path, kind):
+        raise UserError(f"{str(path)!r} is no file of `{_MEASURED[kind][0]}`")
+    return read_csv(path)
 
 
 def _varied(points: Sequence[Point]) -> list[str]:
@@ -368,9 +381,7 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
     Raises:
         UserError: If the files are others.
     """
-    if not _is_measured(measured):
-        raise UserError(f"{str(measured)!r} is no file of `ppl horizon`")
-    frame = read_csv(measured)
+    frame = _measured(measured, "horizon")
     names = ["seed", "step", "predicted_step", "drift", "coverage", "gap", "error"]
     frame = frame[names].astype(float)
     seeds = frame["seed"].nunique()
@@ -508,9 +519,7 @@ def growth(measured: Path, out: Path) -> None:
     Raises:
         UserError: If the file is another.
     """
-    if not _is_growth(measured):
-        raise UserError(f"{str(measured)!r} is no file of `ppl bench --parts growth`")
-    frame = read_csv(measured)
+    frame = _measured(measured, "growth")
     names = [name for name in GROWTH if (frame["axis"] == name).any()]
     picture, rows = _canvas(2, -(-len(names) // 2), (11, 6.2))
     for panel in rows.ravel()[len(names) :]:

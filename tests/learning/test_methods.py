@@ -91,14 +91,14 @@ WATCHED = [
 
 @pytest.mark.parametrize("name", WATCHED)
 def test_nothing_is_learnt_where_nobody_intervenes(name):
-    world, alone = PROBES.get(name, Probe)(), programs(name, PROBES.get(name, Probe))
+    probe, alone = Probe(), programs(name)
     watched = algorithms.method(name).make
 
     def careless(spec, config):
         never = lambda state, point, hparams: jnp.zeros((), bool)  # noqa: E731
         return watched(spec, config)._replace(decide=never)
 
-    unwatched = make_train(world, world.scripted_expert, careless, alone.config)
+    unwatched = make_train(probe, probe.scripted_expert, careless, alone.config)
     start = alone.init(jax.random.key(0), alone.hparams.learning_rate)
     end, _ = jax.jit(unwatched.run_chunk)(start, 10)
     assert int(end.counters.human_data) == 0
