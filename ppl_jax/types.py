@@ -45,6 +45,8 @@ class Outcome:
     Attributes:
         reward, cost, progress, speed: Scalars (see `StepInfo`).
         terminated, truncated, success, unsafe: Booleans.
+        clearance: Distance to the nearest thing that would make it unsafe; inf where there is none
+            or the environment does not say.
         physics_diverged: The physics gave a value that is not finite; the state is the one before,
             and the episode ends here.
     """
@@ -57,6 +59,7 @@ class Outcome:
     unsafe: jax.Array
     progress: jax.Array
     speed: jax.Array
+    clearance: jax.Array | float = float("inf")
     physics_diverged: jax.Array | bool = False
 
 
@@ -68,6 +71,7 @@ class Trajectory:
         observation: [H, O] predicted observations, or [0, O] where none were asked for.
         reward, speed: Reward and speed of each predicted step.
         unsafe, success, terminated: Booleans.
+        clearance: Distance to the nearest thing that would make each state unsafe.
         valid: The step was made: the prediction had not ended before it.
         expert_actions: [H, A] the expert's action at each predicted state, where it was asked, else
             None.
@@ -81,6 +85,7 @@ class Trajectory:
     success: jax.Array
     terminated: jax.Array
     valid: jax.Array
+    clearance: jax.Array | None = None
     expert_actions: jax.Array | None = None
     position: jax.Array | None = None
 

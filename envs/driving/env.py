@@ -436,6 +436,10 @@ class Driving(Environment):
             unsafe=(events.off_road | events.crash_vehicle | events.crash_object) & ~events.arrived,
             progress=navigation.travelled / scenario.route_length,
             speed=jnp.sqrt(jnp.sum(ego.velocity**2)),
+            clearance=jnp.minimum(
+                jnp.minimum(found.left, found.right) - vehicle.HALF_SIZE[1],
+                -jnp.max(touch.depth),
+            ),
         )
 
     def observe(self, state: DrivingState, params: DrivingParams) -> jax.Array:

@@ -89,29 +89,23 @@ def scripted_expert(
         params: Parameters of the environment.
     """
     del key, observation
-    return drive(state, params, CRUISE_SPEED, tracks_wrecks=False)
+    return drive(state, params, CRUISE_SPEED)
 
 
 def cautious_expert(
     key: jax.Array, state: DrivingState, observation: jax.Array, params: DrivingParams
 ) -> jax.Array:
-    """`scripted_expert`, slower and minding wrecks that were pushed away.
-
-    A neural expert first learns from it.
-    """
+    """`scripted_expert`, slower: a neural expert first learns from it."""
     del key, observation
-    return drive(state, params, CAUTIOUS_SPEED, tracks_wrecks=True)
+    return drive(state, params, CAUTIOUS_SPEED)
 
 
-def drive(
-    state: DrivingState, params: DrivingParams, cruise_speed: float, tracks_wrecks: bool
-) -> jax.Array:
+def drive(state: DrivingState, params: DrivingParams, cruise_speed: float) -> jax.Array:
     """The experts' action, [2], at no more than `cruise_speed` m/s.
 
     Args:
         state, params: State and parameters of the environment.
         cruise_speed: m/s.
-        tracks_wrecks: Wrecks are where they were pushed to; else forgotten once they lie still.
     """
     scenario = tree_index(params.scenarios, state.scenario)
     lanes, ego = scenario.lanes, state.ego
@@ -123,7 +117,7 @@ def drive(
     here = lateral / width  # lane number as a real number
     ego_along = _along_route(scenario, road, long)
 
-    things = _things(scenario, state, ego_along, tracks_wrecks)
+    things = _things(scenario, state, ego_along)
     target = _choose_lane(scenario, road, here, things=things, speed=speed, width=width)
 
     # steering: pure pursuit of the target lane's centre line
@@ -170,15 +164,10 @@ def drive(
 
 
 def _crossing_limit(scenario: Scenario, state: DrivingState) -> jax.Array:
-    """Speed allowed by vehicles close ahead that turn off or cross, and by pushed wrecks, m/s."""
-    traffic, ego, objects = state.traffic, state.ego, scenario.objects
-    pose = jnp.concatenate([traffic_model.poses(scenario, traffic), state.box_pose])
-    half = jnp.concatenate([scenario.traffic.half, objects.box_half])
-    wreck_speed = jnp.sqrt(jnp.sum(state.box_velocity**2, -1))
-    speed = jnp.concatenate([traffic.speed, wreck_speed])
-    there = jnp.concatenate(
-        [traffic.status != traffic_model.REMOVED, objects.box_is_vehicle & (wreck_speed > 0.1)]
-    )
+    """Speed allowed by vehicles close ahead that turn off or cross, m/s."""
+    traffic, ego = state.traffic, state.ego
+    pose, half, speed = traffic_model.poses(scenario, traffic), scenario.traffic.half, traffic.speed
+    there = traffic.status != traffic_model.REMOVED
     local = to_body(pose[:, :2] - ego.pose[:2], ego.pose[2])
     same_way = jnp.cos(pose[:, 2] - ego.pose[2])
     in_front = (
@@ -194,9 +183,8 @@ def _crossing_limit(scenario: Scenario, state: DrivingState) -> jax.Array:
     return jnp.min(jnp.where(in_front, allowed, jnp.inf))
 
 
-def _things(
-    scenario: Scenario, state: DrivingState, ego_along: jax.Array, tracks_wrecks: bool
-) -> Things:
+def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Things:
+    """Traffic, and objects where they were pushed to."""
     lanes, objects, traffic = scenario.lanes, scenario.objects, state.traffic
     plan = scenario.traffic
     leg = jnp.take_along_axis(plan.way_first, traffic.leg[:, None], 1)[:, 0]
@@ -211,22 +199,17 @@ def _things(
     half = jnp.concatenate([plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)])
     strayed = jnp.sum((state.box_pose - objects.box_pose)[:, :2] ** 2, -1) > 0.25
     vehicles, boxes = traffic.status.shape[0], strayed.shape[0]
-    along, across = objects.along, objects.across
-    if tracks_wrecks:
-        road = scenario.route_lane[jnp.maximum(route[vehicles : vehicles + boxes], 0)]
-        place = lane_coordinates(tree_index(lanes, road), state.box_pose[:, :2])
-        along, across = (
-            jnp.asarray(x).at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
-            for x, now in zip((along, across), place, strict=True)
-        )
-        strayed = jnp.zeros_like(strayed)
+    road = scenario.route_lane[jnp.maximum(route[vehicles : vehicles + boxes], 0)]
+    place = lane_coordinates(tree_index(lanes, road), state.box_pose[:, :2])
+    along, across = (
+        jnp.asarray(x).at[:boxes].set(jnp.where(strayed, now, x[:boxes]))
+        for x, now in zip((objects.along, objects.across), place, strict=True)
+    )
     ahead = (
         _along_route(scenario, jnp.maximum(route, 0), jnp.concatenate([share, along])) - ego_along
     )
-    # a wreck that was pushed away is not where the lane says; `_crossing_limit` minds it
-    strayed = jnp.pad(strayed, (vehicles, objects.circle.shape[0]))
     return Things(
-        ahead=jnp.where((route >= 0) & ~strayed, ahead, jnp.inf),
+        ahead=jnp.where(route >= 0, ahead, jnp.inf),
         lateral=jnp.concatenate([offset, across]),
         half_length=half[:, 0],
         half_width=half[:, 1],

@@ -1,5 +1,6 @@
 """The driving world against brute force, properties and known answers."""
 
+import dataclasses
 import functools
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 
 from envs.driving import geometry, lidar, observation, vehicle
 from envs.driving import navigation as nav
+from envs.driving import traffic as traffic_model
 from envs.driving.env import contacts
 from envs.driving.make import make_driving
 from envs.driving.maps import MapSettings, _draw_blocks, generate
@@ -305,6 +307,77 @@ def test_the_scripted_expert_recovers_after_a_random_driver(world):
     alive, success = run(jnp.arange(6), jax.random.split(jax.random.key(0), 6))
     assert int(alive.sum()) >= 4
     assert float(success.sum() / alive.sum()) >= 0.8
+
+
+def test_the_scripted_expert_gets_free_of_what_a_blind_driver_ran_into():
+    """Handed over 1.5 s after the first contact, it does not push on: seconds of cost, not minutes.
+
+    The blind driver is the expert itself on a road that it believes to be empty.
+    """
+    world = make_driving(training=[2000, 2005, 2038, 2057, 2086, 2092], held_out=[1000])
+    params = world.default_params
+    objects = params.scenarios.objects
+    nothing = dataclasses.replace(objects, lane=jnp.full_like(objects.lane, -1))
+    empty = params.replace(scenarios=dataclasses.replace(params.scenarios, objects=nothing))
+    removed = traffic_model.REMOVED
+
+    def step(carry, _):
+        state, over, since, cost, success = carry
+        blind = state.replace(
+            traffic=dataclasses.replace(
+                state.traffic, status=jnp.full_like(state.traffic.status, removed)
+            )
+        )
+        handed_over = since > 15
+        action = jnp.where(
+            handed_over,
+            world.scripted_expert(None, state, None, params),
+            world.scripted_expert(None, blind, None, empty),
+        )
+        after, out = world.transition(None, state, action, params)
+        costs = ~over & (out.cost > 0)
+        after = jax.tree.map(lambda new, old: jnp.where(over, old, new), after, state)
+        since = since + (~over & ((since > 0) | costs))
+        cost, success = cost + (costs & handed_over), success | (~over & out.success)
+        return (after, over | out.terminated, since, cost, success), None
+
+    def run(index):
+        no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        start = world.reset_to(index, None, params), no, zero, zero, no
+        (_, _, since, cost, success), _ = jax.lax.scan(step, start, None, length=700)
+        return since > 15, cost, success
+
+    handed_over, cost, success = jax.jit(lambda which: jax.lax.map(run, which))(jnp.arange(6))
+    assert int(handed_over.sum()) >= 5
+    assert bool(jnp.all(success[handed_over]))
+    assert int(cost.max()) <= 40  # before wrecks were tracked one was pushed for 500 steps
+
+
+def test_the_clearance_is_the_distance_to_edges_and_things(world):
+    params = world.default_params
+    state = world.reset_to(jnp.int32(0), None, params)
+    after, outcome = jax.jit(world.transition)(None, state, jnp.zeros(2), params)
+    scenario = tree_index(params.scenarios, after.scenario)
+    sides = float(jnp.minimum(after.left, after.right)) - vehicle.HALF_SIZE[1]
+    poses = np.concatenate([traffic_model.poses(scenario, after.traffic), after.box_pose])
+    half = np.concatenate([scenario.traffic.half, scenario.objects.box_half])
+
+    def corners(pose, half):
+        signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        return pose[:2] + (signs * half) @ np.array([[c, s], [-s, c]])
+
+    mine, gaps = corners(np.asarray(after.ego.pose), np.array(vehicle.HALF_SIZE)), []
+    for pose, size in zip(poses, half, strict=True):
+        theirs, apart = corners(pose, size), []
+        for heading in (float(after.ego.pose[2]), pose[2]):
+            for angle in (heading, heading + np.pi / 2):
+                axis = np.array([np.cos(angle), np.sin(angle)])
+                a, b = mine @ axis, theirs @ axis
+                apart.append(max(b.min() - a.max(), a.min() - b.max()))
+        gaps.append(max(apart))
+    assert float(outcome.clearance) == pytest.approx(min(sides, *gaps), abs=2e-3)
+    assert float(outcome.clearance) < 2.0
 
 
 def test_a_wreck_is_pushed_and_a_cone_is_not_in_the_way():
