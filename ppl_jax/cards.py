@@ -56,6 +56,8 @@ class EnvCard:
         settings: Settings that every preset changes for this environment.
         preset_settings: Settings that one preset changes besides, by the preset's name.
         missing_presets: Presets that are not for this environment.
+        sets: Further sets of generated scenarios that evaluations may play, by name: their numbers,
+            which the maker takes as `held_out`.
         step_ms: Time of a training step on one core at batch 256, ms, for estimates.
         compile_s: Time to compile its training program for the first time, s, for estimates.
         expert: How its neural expert is trained.
@@ -79,6 +81,7 @@ class EnvCard:
     settings: Changes = dataclasses.field(default_factory=dict)
     preset_settings: Mapping[str, Changes] = dataclasses.field(default_factory=dict)
     missing_presets: tuple[str, ...] = ()
+    sets: Mapping[str, tuple[int, ...]] = dataclasses.field(default_factory=dict)
     step_ms: float = 5.0
     compile_s: float = 25.0
     expert: ExpertCard = dataclasses.field(default_factory=ExpertCard)

@@ -34,6 +34,13 @@ _EXPERT = ExpertCard(
     teacher="cautious",
 )
 
+# "tuning" is for choosing settings: the scenarios of training and twice as many unseen ones;
+# "confirmation" for reporting them: the held-out ones and more of their kind
+_SETS = {
+    "tuning": (*range(100, 150), *range(2000, 2100)),
+    "confirmation": (*range(1000, 1050), *range(3000, 3200)),
+}
+
 DRIVING = EnvCard(
     title="Driving",
     summary="A car drives to the end of its route, through traffic and obstacles (MetaDrive).",
@@ -45,6 +52,7 @@ DRIVING = EnvCard(
     neural_expert=True,
     demonstrations=20_000,
     warm_up=600,
+    sets=_SETS,
     step_ms=5.0,
     expert=_EXPERT,
 )

@@ -26,6 +26,13 @@ _HPARAMS = {
     "demonstration_noise": 0.2,
 }
 
+# "tuning" is for choosing settings: scenarios of training and as many unseen ones; "confirmation"
+# for reporting them: the held-out ones and more of their kind
+_SETS = {
+    "tuning": (*range(50), *range(2000, 2050)),
+    "confirmation": (*range(1000, 1050), *range(3000, 3200)),
+}
+
 TABLE_WIPING = EnvCard(
     title="Table wiping",
     summary="A UR5e presses a wiper on a table until all dirt is gone (robosuite Wipe).",
@@ -50,6 +57,7 @@ TABLE_WIPING = EnvCard(
     # robosuite's normalised reward, a wiper that hovers over the dirt's centroid passes the gate.
     preset_settings={"default": {"min_return": _MARKER}},
     missing_presets=("reference",),
+    sets=_SETS,
     step_ms=5.0,
     # where hovering over the last marker pays for ever, solving the task must pay more
     expert=ExpertCard(
@@ -80,6 +88,7 @@ NUT_ASSEMBLY = EnvCard(
         "min_return": 2.0,
     },
     missing_presets=("reference",),
+    sets=_SETS,
     step_ms=10.0,
     expert=ExpertCard(
         config={**_CONFIG, "total_steps": 1_000_000},
@@ -105,6 +114,7 @@ LIFT = EnvCard(
         "preference_horizon": 6,
     },
     missing_presets=("reference",),
+    sets=_SETS,
     step_ms=30.0,
     compile_s=200.0,
 )

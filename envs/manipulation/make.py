@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -51,8 +52,8 @@ def make_backend(name: str, physics: str = "auto", **options: Any) -> Backend:
 
 
 def make_table_wiping(
-    training: range = TRAINING_SCENARIOS,
-    held_out: range = HELD_OUT_SCENARIOS,
+    training: Sequence[int] = TRAINING_SCENARIOS,
+    held_out: Sequence[int] = HELD_OUT_SCENARIOS,
     *,
     physics: str = "auto",
 ) -> wiping.TableWiping:
@@ -70,8 +71,8 @@ def make_table_wiping(
 
 
 def make_nut_assembly(
-    training: range = TRAINING_SCENARIOS,
-    held_out: range = HELD_OUT_SCENARIOS,
+    training: Sequence[int] = TRAINING_SCENARIOS,
+    held_out: Sequence[int] = HELD_OUT_SCENARIOS,
     *,
     physics: str = "auto",
 ) -> nut.NutAssembly:
@@ -87,8 +88,8 @@ def make_nut_assembly(
 
 
 def make_lift(
-    training: range = TRAINING_SCENARIOS,
-    held_out: range = HELD_OUT_SCENARIOS,
+    training: Sequence[int] = TRAINING_SCENARIOS,
+    held_out: Sequence[int] = HELD_OUT_SCENARIOS,
     *,
     physics: str = "auto",
 ) -> lift.Lift:

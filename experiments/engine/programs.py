@@ -76,12 +76,13 @@ class Programs:
             env: The environment.
             functions: The method's functions (`ppl_jax.training.make_train`).
             interval: Steps of a block, K.
-            on: "held_out" or "training": the scenarios that evaluations play.
+            on: The scenarios that evaluations play: "training", or those that the environment was
+                made with as its held-out ones.
             side_by_side: Everything has a leading axis of runs, which are stepped together.
             announce: Called around each compilation.
         """
         self.env, self.functions, self.interval = env, functions, interval
-        self.pool = env.held_out_params if on == "held_out" else env.default_params
+        self.pool = env.default_params if on == "training" else env.held_out_params
         self.side_by_side, self.announce = side_by_side, announce
         self.compile_s = 0.0
         self._compiled: dict[str, Callable[..., Any]] = {}

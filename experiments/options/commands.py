@@ -42,6 +42,8 @@ class Compare:
     """Environment steps of each run (bc and gail keep their own)."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
+    evaluate_on: str = "held_out"
+    """Scenarios that are played: held_out, training, or a set that `ppl list` names."""
     gate: str | None = None
     """Rule by which the expert takes over (default: the paper's rule for the environment)."""
     min_return: float | None = None
@@ -83,6 +85,8 @@ class Ablation:
     """Expert steps that the reference policy of DPO and IPO clones."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
+    evaluate_on: str = "held_out"
+    """Scenarios that are played: held_out, training, or a set that `ppl list` names."""
     batch_size: int | None = None
     """Samples per loss and update."""
     physics: str | None = None
@@ -189,6 +193,8 @@ class Sweep:
     """Draw each scenario's dynamics within the environment's ranges, which are axes then."""
     evaluate_every: int | None = None
     """Steps between evaluations (default: a tenth of the run)."""
+    evaluate_on: str = "held_out"
+    """Scenarios that are played: held_out, training, or a set that `ppl list` names."""
     expert: str = "scripted"
     """scripted, neural (the shipped one), or a policy file or run folder."""
     scenarios: str | None = None

@@ -30,6 +30,7 @@ from experiments.options.settings import (
 )
 from ppl_jax.config import PRESETS, Setting, TrainConfig
 
+EVALUATE_ON = "Scenarios that are played: held_out, training, or a set that `ppl list` names."
 _EXPERT = "scripted, neural (shipped), a policy file or run folder; or recorded PATH, a session."
 _OWN: dict[str, list[Any]] = {
     "run": [
@@ -53,7 +54,7 @@ _OWN: dict[str, list[Any]] = {
             0,
             "Steps between evaluations and checkpoints; a tenth of the run.",
         ),
-        ("evaluate_on", Literal["held_out", "training"], "held_out", "Scenarios that are played."),
+        ("evaluate_on", str, "held_out", EVALUATE_ON),
         (
             "scenarios",
             str | None,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _OF_EVERY_METHOD = ("batch_size", "physics")
 OPTIONS = ("gate", "min_return", "max_departure", "min_log_density", *_OF_EVERY_METHOD)
-COMMON = ("preset", "expert", "scenarios", "held_out_scenarios")
+COMMON = ("preset", "expert", "scenarios", "held_out_scenarios", "evaluate_on")
 
 
 def compare(command: Compare) -> None:

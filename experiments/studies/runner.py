@@ -167,7 +167,7 @@ def _settings(
     return settings
 
 
-_COMMON = ("preset", "expert", "scenarios", "held_out_scenarios")
+_COMMON = ("preset", "expert", "scenarios", "held_out_scenarios", "evaluate_on")
 
 
 @dataclasses.dataclass(frozen=True)

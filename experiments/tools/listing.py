@@ -38,6 +38,14 @@ def listing() -> str:
         "gates": [
             f"{name:20} {_first_line(gate(name).decide)}".rstrip() for name in registered_gates()
         ],
+        "scenarios to evaluate on": [
+            "held_out, training",
+            *(
+                f"{name:20} {', '.join(card(name).sets)}"
+                for name in registered()
+                if card(name).sets
+            ),
+        ],
         "predictors": [
             f"{name:20} {_first_line(predictor(name).make)}".rstrip()
             for name in registered_predictors()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import flax.struct
 import jax
@@ -273,7 +274,7 @@ class NutAssembly(ArmTask):
         return self.with_sensor_noise(seen, state, params)
 
 
-def make_params(numbers: range) -> NutParams:
+def make_params(numbers: Sequence[int]) -> NutParams:
     """Starts of the scenarios with these numbers."""
 
     def start(number: jax.Array) -> tuple[Array, jax.Array]:
@@ -283,7 +284,7 @@ def make_params(numbers: range) -> NutParams:
         noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
         return INITIAL_JOINTS + noise, jax.random.uniform(key_place, (3,), minval=low, maxval=high)
 
-    number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
+    number = jnp.asarray(tuple(numbers), jnp.int32)
     joints, place = jax.jit(jax.vmap(start))(number)
     return NutParams(
         joints=joints.astype(jnp.float32),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.struct
@@ -363,7 +364,7 @@ class TableWiping(ArmTask):
         return self.with_sensor_noise(seen, state, params)
 
 
-def make_params(numbers: range) -> WipingParams:
+def make_params(numbers: Sequence[int]) -> WipingParams:
     """Starts of the scenarios with these numbers."""
 
     def start(number: jax.Array) -> tuple[Array, jax.Array]:
@@ -371,7 +372,7 @@ def make_params(numbers: range) -> WipingParams:
         noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
         return INITIAL_JOINTS + noise, draw_markers(key_markers, _HALF) + jnp.array(_CENTRE)
 
-    number = jnp.arange(numbers.start, numbers.stop, numbers.step, dtype=jnp.int32)
+    number = jnp.asarray(tuple(numbers), jnp.int32)
     joints, markers = jax.jit(jax.vmap(start))(number)
     return WipingParams(
         joints=joints.astype(jnp.float32),
