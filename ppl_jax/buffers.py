@@ -65,12 +65,27 @@ def add(buffer: RingBuffer, items: PyTree, mask: jax.Array) -> RingBuffer:
     return RingBuffer(data=data, next=(buffer.next + count) % rows, added=buffer.added + count)
 
 
-def sample(buffer: RingBuffer, key: jax.Array, count: int) -> PyTree:
+def sample(
+    buffer: RingBuffer, key: jax.Array, count: int, recency: jax.Array | float | None = None
+) -> PyTree:
     """`count` items drawn with replacement.
 
     An empty buffer returns zeros; mask the loss.
+
+    Args:
+        buffer: To draw from.
+        key: Random key.
+        count: Number of items.
+        recency: r: of n items the k-th oldest is drawn with a probability that grows as (k / n)^r;
+            all alike where None.
     """
-    index = jax.random.randint(key, (count,), 0, jnp.maximum(size(buffer), 1))
+    held = size(buffer)
+    if recency is None:
+        index = jax.random.randint(key, (count,), 0, jnp.maximum(held, 1))
+    else:
+        rank = held * jax.random.uniform(key, (count,)) ** (1.0 / (1.0 + recency))
+        rank = jnp.clip(rank.astype(jnp.int32), 0, jnp.maximum(held - 1, 0))
+        index = (buffer.next - held + rank) % capacity(buffer)
     return jax.tree.map(lambda leaf: leaf[index], buffer.data)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from ppl_jax.cards import card
 from ppl_jax.checks import did_you_mean
+from ppl_jax.distributions import LAPLACE_CORE, LAPLACE_SCALE
 from ppl_jax.fields import About, about, setting
 
 
@@ -38,7 +39,8 @@ class HParams:
     """Traced settings: leaves of one pytree, so any of them may carry a batch axis.
 
     Attributes:
-        learning_rate, expert_noise, prediction_noise: See the fields' own text.
+        learning_rate, expert_noise, prediction_noise, give_up_after, laplace_scale, laplace_core:
+            See the fields' own text.
         method, gate, predictor: Traced settings that these own.
         world: The ranges that worlds are drawn within; `NoHParams` where they are not randomised.
     """
@@ -55,10 +57,25 @@ class HParams:
     )
     prediction_noise: jax.Array | float = setting(
         0.0,
-        "epsilon: predicted observations s get noise e with |e| = epsilon |s|.",
+        "epsilon: predicted observations s get noise e with |e| = epsilon |s|; see noise_at.",
         low=0,
         group="predictor",
         common=True,
+    )
+    give_up_after: jax.Array | float = setting(
+        0,
+        "Steps with cost in a row under the expert's control after which a training episode is "
+        "given up; 0 never.",
+        low=0,
+        group="gate",
+    )
+    laplace_scale: jax.Array | float = setting(
+        LAPLACE_SCALE, "b of the likelihood laplace: how fast it falls.", low=1e-3
+    )
+    laplace_core: jax.Array | float = setting(
+        LAPLACE_CORE,
+        "w of the likelihood laplace: the distance within which it is round.",
+        low=1e-3,
     )
     method: Any = dataclasses.field(default_factory=NoHParams)
     gate: Any = dataclasses.field(default_factory=NoHParams)
@@ -130,6 +147,13 @@ class TrainConfig:
         "Transition that predictions use; `ppl list` names them.",
         group="predictor",
         common=True,
+    )
+    noise_at: Literal["pairs", "gate", "both"] = setting(
+        "pairs",
+        "What prediction_noise disturbs: the states of the preference pairs (the paper's study), "
+        "the steps of the gate's lookahead, or both.",
+        choices=("pairs", "gate", "both"),
+        group="predictor",
     )
     gate: str = setting(
         "unsafe_or_slow",

@@ -51,19 +51,34 @@ class UnsafeOrSlowHParams:
         group="gate",
         common=True,
     )
+    min_clearance: jax.Array | float = setting(
+        0.0,
+        "Predicted distance to the road's edge or to a thing below which the expert takes over, m.",
+        low=0,
+        group="gate",
+    )
+    min_gain: jax.Array | float = setting(
+        100.0,
+        "Predicted gain in speed from which on a slow start is not slow, m/s.",
+        low=0,
+        group="gate",
+    )
 
 
 def unsafe_or_slow(point: DecisionPoint, hparams: UnsafeOrSlowHParams, scale: Scale) -> jax.Array:
     """The paper's driving rule: any predicted crash or leaving the road, or mean speed too low.
 
-    A prediction that ends in success is not slow.
+    A prediction that ends in success is not slow, nor one that gains `min_gain`.
     """
     del scale
     trajectory = point.trajectory
     steps = jnp.maximum(jnp.sum(trajectory.valid), 1)
     mean_speed = jnp.sum(trajectory.speed * trajectory.valid) / steps
-    slow = (mean_speed < hparams.min_speed) & ~jnp.any(trajectory.success)
-    return jnp.any(trajectory.unsafe) | slow
+    gain = trajectory.speed[steps - 1] - trajectory.speed[0]
+    slow = (mean_speed < hparams.min_speed) & (gain < hparams.min_gain)
+    clearance = trajectory.clearance
+    near = clearance is not None and jnp.any(clearance < hparams.min_clearance)
+    return jnp.any(trajectory.unsafe) | near | (slow & ~jnp.any(trajectory.success))
 
 
 @flax.struct.dataclass

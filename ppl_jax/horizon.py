@@ -32,8 +32,11 @@ import jax.numpy as jnp
 
 from ppl_jax.config import HParams, TrainConfig, env_params
 from ppl_jax.gates import gate
-from ppl_jax.predictors import Act, predict, predictor
+from ppl_jax.predictors import predict, predictor
 from ppl_jax.types import Array, DecisionPoint, Env, Expert
+
+Policy = Callable[[jax.Array], jax.Array]
+"""`policy(observation [O]) -> action [A]`."""
 
 MEMORY = 500  # predicted trajectories that the moving means look back
 
@@ -212,7 +215,7 @@ def watch(
     config: TrainConfig,
     *,
     key: jax.Array,
-    act: Act,
+    act: Policy,
     hparams: HParams,
     steps: int,
 ) -> Watched:
@@ -335,7 +338,7 @@ def make_profile(
     steps: int = 500,
     visited: int = 500,
     kept: int = 500,
-) -> Callable[[jax.Array, Act, HParams], Profile]:
+) -> Callable[[jax.Array, Policy, HParams], Profile]:
     """`profile(key, act, hparams)`: the worth of preferences at predicted states now.
 
     The novice alone plays training scenarios. Where the gate would hand over, its action is
@@ -357,7 +360,7 @@ def make_profile(
     predictor(config.predictor).make(env)  # refused now rather than where `profile` is called
     scale = jnp.asarray(env.spec.observation_scale)
 
-    def profile(key: jax.Array, act: Act, hparams: HParams) -> Profile:
+    def profile(key: jax.Array, act: Policy, hparams: HParams) -> Profile:
         key, key_visited, key_kept = jax.random.split(key, 3)
         lane = functools.partial(watch, env, expert, config, act=act, hparams=hparams, steps=steps)
         rows = jax.vmap(lambda key: lane(key=key))(jax.random.split(key, num_envs))

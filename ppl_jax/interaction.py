@@ -24,6 +24,7 @@ from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory
 
 PyTree = Any
 KEYS = 6  # of a step
+_PROPOSE, _AHEAD = 1, 3  # the novice's and the predictor's among them
 
 
 @flax.struct.dataclass
@@ -33,6 +34,7 @@ class Counters:
     Attributes:
         steps: Environment steps.
         human_data: Steps under the expert's control.
+        human_cost_steps: Those of them that had a cost.
         takeovers: Times the expert took control.
         episodes, successes: Training episodes that ended, and with success.
         cost: Sum of step costs while training.
@@ -41,6 +43,7 @@ class Counters:
 
     steps: jax.Array
     human_data: jax.Array
+    human_cost_steps: jax.Array
     takeovers: jax.Array
     episodes: jax.Array
     successes: jax.Array
@@ -56,6 +59,7 @@ class Learner:
         algorithm: The method's own state (parameters, optimiser, buffers).
         env_state: The environment.
         takeover: The expert is in control.
+        costly: Steps with cost in a row that it has made until now.
         key: Random key.
         hparams: The run's hyper-parameters.
         counters: `Counters`.
@@ -65,6 +69,7 @@ class Learner:
     algorithm: PyTree
     env_state: PyTree
     takeover: jax.Array
+    costly: jax.Array
     key: jax.Array
     hparams: HParams
     counters: Counters
@@ -136,11 +141,13 @@ def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
         algorithm=problem.algorithm.init(key_algorithm),
         env_state=env_state,
         takeover=jnp.zeros((), bool),
+        costly=zero,
         key=key,
         hparams=as_arrays(hparams),
         counters=Counters(
             steps=zero,
             human_data=zero,
+            human_cost_steps=zero,
             takeovers=zero,
             episodes=zero,
             successes=zero,
@@ -151,10 +158,13 @@ def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
     )
 
 
-def sample_novice_action(
-    problem: Problem, learner: Learner, key: jax.Array, observation: jax.Array
-) -> jax.Array:
-    """The novice's action [A], not yet clipped; a random one in the first `random_steps`."""
+def propose(problem: Problem, learner: Learner, observation: jax.Array) -> jax.Array:
+    """The novice's action [A] in the coming step, not yet clipped.
+
+    A random one in the first `random_steps`. It is drawn with the step's own key: asked before the
+    step, by the gate or to show its path, the novice says what it then does.
+    """
+    key = jax.random.split(learner.key, KEYS)[_PROPOSE]
     key_act, key_guess = jax.random.split(key)
     action = problem.algorithm.act(learner.algorithm, key_act, observation)
     random_steps = problem.config.random_steps
@@ -176,13 +186,21 @@ def query_expert(
     return jnp.clip(action + noise, -1.0, 1.0)
 
 
+def ahead_key(learner: Learner) -> jax.Array:
+    """The predictor's key in the coming step."""
+    return jax.random.split(learner.key, KEYS)[_AHEAD]
+
+
 def transition_of(problem: Problem, hparams: PyTree) -> Callable[..., tuple[PyTree, Outcome]]:
     """The predictor's `transition(key, state, action, params)` under its traced settings."""
     return functools.partial(problem.transition, hparams=hparams)
 
 
 def look_ahead(problem: Problem, learner: Learner, key: jax.Array, action: jax.Array) -> Trajectory:
-    """The first predicted states, for the pairs; skipped while the novice is in control."""
+    """The first predicted states, for the pairs; skipped while the novice is in control.
+
+    Where `noise_at` says so they are disturbed as in the paper's study of imperfect predictors.
+    """
     key_predict, key_noise = jax.random.split(key)
 
     def ahead(learner: Learner, key: jax.Array, action: jax.Array, params: PyTree) -> Trajectory:
@@ -194,6 +212,8 @@ def look_ahead(problem: Problem, learner: Learner, key: jax.Array, action: jax.A
         ahead = jax.custom_batching.sequential_vmap(ahead)
     only = dataclasses.replace(learner, algorithm=None, counters=None)  # what it reads
     trajectory = ahead(only, key_predict, action, params_of(problem, learner.hparams))
+    if problem.config.noise_at == "gate":
+        return trajectory
     noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
     return dataclasses.replace(trajectory, observation=noisy)
 
@@ -235,6 +255,7 @@ def no_prediction() -> Trajectory:
         success=no,
         terminated=no,
         valid=no,
+        clearance=empty,
     )
 
 
@@ -252,9 +273,9 @@ def interact(
     env, state = problem.env, learner.env_state
     params = params_of(problem, learner.hparams)
     keys = jax.random.split(learner.key, KEYS)
-    key, key_propose, key_expert, key_ahead, key_env, key_reset = keys
+    key, _, key_expert, key_ahead, key_env, key_reset = keys  # the novice's is `propose`'s
     observation = env.observe(state, params)
-    novice_action = sample_novice_action(problem, learner, key_propose, observation)
+    novice_action = propose(problem, learner, observation)
     if action is None:
         action = query_expert(problem, learner, key_expert, observation)
     takeover = learner.takeover
@@ -264,6 +285,9 @@ def interact(
     else:
         predicted = no_prediction()
     after, outcome = env.transition(key_env, state, executed, params)
+    costly = jnp.where(takeover & (outcome.cost > 0), learner.costly + 1, 0)
+    patience = learner.hparams.give_up_after
+    hopeless = (patience > 0) & (costly >= patience) & ~outcome.terminated
     interaction = Interaction(
         observation=observation,
         next_observation=env.observe(after, params),
@@ -275,16 +299,21 @@ def interact(
         reward=outcome.reward,
         cost=outcome.cost,
         terminated=outcome.terminated,
-        truncated=outcome.truncated,
+        truncated=outcome.truncated | hopeless,
         success=outcome.success,
         predicted=predicted,
     )
-    done = outcome.terminated | outcome.truncated
+    done = interaction.terminated | interaction.truncated
     restarted = jax.lax.cond(done, lambda k: env.reset(k, params)[1], lambda _: after, key_reset)
     learner = dataclasses.replace(learner, key=key)
     learner = store(problem, learner, interaction, outcome.physics_diverged)
-    # a takeover ends with its episode; the gate next runs at a multiple of K
-    learner = dataclasses.replace(learner, env_state=restarted, takeover=takeover & ~done)
+    # a takeover ends with its episode
+    learner = dataclasses.replace(
+        learner,
+        env_state=restarted,
+        takeover=takeover & ~done,
+        costly=jnp.where(done, 0, costly),
+    )
     return learner, interaction
 
 
@@ -302,6 +331,7 @@ def store(
         counters=Counters(
             steps=counters.steps + 1,
             human_data=counters.human_data + step.takeover,
+            human_cost_steps=counters.human_cost_steps + (step.takeover & (step.cost > 0)),
             takeovers=counters.takeovers + step.takeover_start,
             episodes=counters.episodes + done,
             successes=counters.successes + step.success,
@@ -366,6 +396,7 @@ def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
     metrics = {f"train/{name}": value for name, value in losses.items()}
     return metrics | {
         "train/human_data_usage": after.human_data,
+        "train/human_cost_steps": after.human_cost_steps,
         "train/intervention_rate": spent.human_data / steps,
         "train/takeovers": spent.takeovers,
         "train/episodes": spent.episodes,

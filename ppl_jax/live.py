@@ -19,14 +19,15 @@ from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.interaction import (
     Learner,
     Problem,
+    ahead_key,
     ingest,
     init,
     interact,
     learn,
     make_problem,
     params_of,
+    propose,
     repeat,
-    sample_novice_action,
     summarise,
     transition_of,
 )
@@ -109,14 +110,13 @@ def predict_path(
     mine: jax.Array,
 ) -> Trajectory:
     """See `LiveFunctions`."""
-    key_propose, key_predict = jax.random.split(learner.key)
     params = params_of(problem, learner.hparams)
     observation = problem.env.observe(learner.env_state, params)
-    novice_action = sample_novice_action(problem, learner, key_propose, observation)
+    novice_action = propose(problem, learner, observation)
     return predict(
         problem.env,
         transition_of(problem, learner.hparams.predictor),
-        key_predict,
+        ahead_key(learner),
         learner.env_state,
         action=jnp.where(mine, action, jnp.clip(novice_action, -1.0, 1.0)),
         params=params,

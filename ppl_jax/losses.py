@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.checks import check_name
-from ppl_jax.distributions import log_likelihood
+from ppl_jax.distributions import Likelihood, surrogate
 from ppl_jax.types import Array
 
 Metrics = dict[str, jax.Array]
@@ -40,9 +40,9 @@ NEEDS_REFERENCE = ("dpo", "ipo")
 
 
 def bc_loss(
-    mean: Array,
+    output: Array,
     expert_action: Array,
-    likelihood: str = "gaussian",
+    likelihood: str | Likelihood = "gaussian",
     reduction: str = "sum",
     *,
     weight: jax.Array | float = 1.0,
@@ -50,9 +50,9 @@ def bc_loss(
     """Behaviour cloning: -E[weight log pi(a_h|s)].
 
     Args:
-        mean: [..., A] policy actions.
-        expert_action: [..., A], of the same shape.
-        likelihood: See `ppl_jax.distributions`.
+        output: [..., A] policy actions, or what else the likelihood reads of a policy.
+        expert_action: [..., A].
+        likelihood: A name, or a `ppl_jax.distributions.Likelihood`.
         reduction: "sum" over action dimensions (the log-likelihood), or "mean" (the released
             code's mean squared error).
         weight: [...] of mean 1, or a number.
@@ -62,12 +62,16 @@ def bc_loss(
         AssertionError: If shapes do not fit.
     """
     check_name("reduction", reduction, REDUCTIONS)
-    chex.assert_equal_shape([mean, expert_action], custom_message="mean and expert_action")
-    chex.assert_is_broadcastable(jnp.shape(weight), mean.shape[:-1])
-    loss = -jnp.mean(weight * log_likelihood(mean, expert_action, likelihood))
+    chex.assert_is_broadcastable(jnp.shape(weight), jnp.shape(expert_action)[:-1])
+    log_pi = _named(likelihood).log_prob(output, expert_action)
+    loss = -jnp.mean(weight * log_pi)
     if reduction == "mean":
-        loss = loss / mean.shape[-1]
+        loss = loss / expert_action.shape[-1]
     return loss, {"loss_bc": loss}
+
+
+def _named(likelihood: str | Likelihood) -> Likelihood:
+    return surrogate(likelihood) if isinstance(likelihood, str) else likelihood
 
 
 class PairLikelihoods(NamedTuple):
@@ -86,48 +90,46 @@ class PairLikelihoods(NamedTuple):
 
 
 def pair_likelihoods(
-    preferred_mean: Array,
+    preferred_output: Array,
     preferred_action: Array,
-    rejected_mean: Array,
+    rejected_output: Array,
     rejected_action: Array,
     *,
     bias: jax.Array | float = 1.0,
-    likelihood: str = "gaussian",
+    likelihood: str | Likelihood = "gaussian",
     reference: tuple[jax.Array, jax.Array] | None = None,
 ) -> PairLikelihoods:
     """The log-likelihoods that every objective reads of a batch of pairs.
 
     Args:
-        preferred_mean, rejected_mean: [B, A] policy actions at the states of either action (the
-            same state in the paper).
+        preferred_output, rejected_output: [B, A] policy actions at the states of either action
+            (the same state in the paper), or what else the likelihood reads of a policy.
         preferred_action, rejected_action: [B, A].
         bias: Factor on the rejected action's likelihood; 1 in the paper.
-        likelihood: See `ppl_jax.distributions`.
-        reference: The reference policy's two means, like `preferred_mean` and `rejected_mean`.
+        likelihood: A name, or a `ppl_jax.distributions.Likelihood`.
+        reference: The reference policy's two outputs, like `preferred_output` and
+            `rejected_output`.
 
     Raises:
         ValueError: If the likelihood is unknown.
         AssertionError: If shapes do not fit.
     """
-    means = [preferred_mean, rejected_mean, *(reference or ())]
-    chex.assert_equal_shape(
-        [*means, preferred_action, rejected_action], custom_message="means and actions"
-    )
-    chex.assert_rank(preferred_mean, 2)
-
-    def log_pi(mean: Array, action: Array) -> jax.Array:
-        return log_likelihood(mean, action, likelihood)
+    outputs = [preferred_output, rejected_output, *(reference or ())]
+    chex.assert_equal_shape(outputs, custom_message="outputs")
+    chex.assert_equal_shape([preferred_action, rejected_action], custom_message="actions")
+    chex.assert_rank(preferred_action, 2)
+    log_pi, attaining = _named(likelihood)
+    attained = attaining(preferred_output, preferred_action)
 
     frozen: jax.Array | float = 0.0
     if reference is not None:
         first, second = reference
         frozen = log_pi(first, preferred_action) - bias * log_pi(second, rejected_action)
     return PairLikelihoods(
-        preferred=log_pi(preferred_mean, preferred_action),
-        rejected=log_pi(rejected_mean, rejected_action),
+        preferred=log_pi(preferred_output, preferred_action),
+        rejected=log_pi(rejected_output, rejected_action),
         reference=frozen,
-        attained=log_pi(preferred_action, preferred_action)
-        - bias * log_pi(preferred_action, rejected_action),
+        attained=log_pi(attained, preferred_action) - bias * log_pi(attained, rejected_action),
     )
 
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from ppl_jax.config import NoHParams, check_unique, did_you_mean
 from ppl_jax.types import Env, Expert, Outcome, Trajectory, Transition
 
-Act = Callable[[jax.Array], jax.Array]
-"""`act(observation [O]) -> action [A]`."""
+Act = Callable[[jax.Array, jax.Array], jax.Array]
+"""`act(key, observation [O]) -> action [A]`."""
 
 
 def predict(
@@ -62,7 +62,7 @@ def predict(
         empty = jnp.zeros((0,), jnp.float32)
         observation = env.observe(after, params) if observe or act is not None else empty
         if act is not None:
-            action = act(observation)
+            action = act(jax.random.fold_in(key, 1), observation)
         expert_actions = None
         if labelling_expert is not None:
             expert_actions = labelling_expert(key, after, env.observe(after, params), params)
@@ -74,6 +74,7 @@ def predict(
             success=alive & outcome.success,
             terminated=alive & outcome.terminated,
             valid=alive,
+            clearance=jnp.where(alive, outcome.clearance, jnp.inf),
             expert_actions=expert_actions,
             position=None if place is None else place(after),
         )
@@ -93,6 +94,40 @@ def add_noise(key: jax.Array, observation: jax.Array, epsilon: jax.Array | float
     norm = jnp.linalg.norm(observation, axis=-1, keepdims=True)
     length = jnp.linalg.norm(noise, axis=-1, keepdims=True)
     return observation + epsilon * norm / jnp.maximum(length, 1e-12) * noise
+
+
+def imperfect(transition: Transition, epsilon: jax.Array | float) -> Transition:
+    """The transition of a predictor whose every step is off by epsilon.
+
+        s'~ = s' + e,   |e| = epsilon |s' - s|
+
+    for each array of real numbers in the state, in a random direction; errors add up along a
+    prediction. Other arrays (counters, flags) stay as they are, and so does the outcome, which is
+    that of the step from the disturbed state before.
+
+    Args:
+        transition: See `ppl_jax.types.Transition`.
+        epsilon: Relative error, traced.
+    """
+
+    def disturbed(key: jax.Array, state: Any, action: jax.Array, params: Any) -> Any:
+        key, key_noise = jax.random.split(key)
+        after, outcome = transition(key, state, action, params)
+        before, new = jax.tree.leaves(state), jax.tree.leaves(after)
+        keys = jax.random.split(key_noise, len(new))
+        off = [_off(*each, epsilon) for each in zip(keys, before, new, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(after), off), outcome
+
+    return disturbed
+
+
+def _off(key: jax.Array, before: Any, after: Any, epsilon: jax.Array | float) -> Any:
+    """One array of a state, disturbed by epsilon times the length of its change."""
+    if not jnp.issubdtype(after.dtype, jnp.floating) or after.size == 0:
+        return after
+    noise = jax.random.normal(key, after.shape, after.dtype)
+    length = jnp.linalg.norm(jnp.ravel(after - before)) / jnp.linalg.norm(jnp.ravel(noise))
+    return after + epsilon * length * noise
 
 
 class Predictor(NamedTuple):

@@ -1,8 +1,9 @@
 """The training loop of every method: Algorithm 1 of the paper as pure functions.
 
-At steps 0, K, 2K, ... the novice proposes an action, the predictor rolls it H steps ahead, and the
-decision whether the expert takes over holds for K steps. Each step is executed, stored and followed
-by one update. Everything is one scan over blocks of K steps; the host acts between chunks of them.
+At steps 0, K, 2K, ... and at the start of every episode the novice proposes an action, the
+predictor rolls it H steps ahead, and the decision whether the expert takes over holds until the
+next. Each step is executed, stored and followed by one update. Everything is one scan over blocks
+of K steps; the host acts between chunks of them.
 
 A run has up to three phases: in `demonstrate` the expert makes every step and nothing is updated,
 in `fit` there are updates and no steps, `interact` is the above. Most methods have only the last.
@@ -29,14 +30,14 @@ from ppl_jax.interaction import (
     learn,
     make_problem,
     params_of,
+    propose,
     query_expert,
     repeat,
-    sample_novice_action,
     summarise,
     transition_of,
 )
 from ppl_jax.losses import Metrics
-from ppl_jax.predictors import predict
+from ppl_jax.predictors import imperfect, predict
 from ppl_jax.types import DecisionPoint, Env, Expert
 
 PyTree = Any
@@ -150,24 +151,65 @@ def make_takeovers(problem: Problem) -> Takeovers:
     )
 
 
-def decide(problem: Problem, takeovers: Takeovers, learner: Learner, key: jax.Array) -> jax.Array:
-    """Whether the expert takes the next block of K steps."""
-    env, params = problem.env, params_of(problem, learner.hparams)
-    key_propose, key_predict, key_expert, key_act = jax.random.split(key, 4)
+def decide(problem: Problem, takeovers: Takeovers, learner: Learner, due: jax.Array) -> Learner:
+    """Let the rule say who takes the coming steps, where a decision is `due`."""
+    key, key_decide = jax.random.split(learner.key)
+    learner = dataclasses.replace(learner, key=key)
+    params = params_of(problem, learner.hparams)
+    ask = _if_due(functools.partial(takes_over, problem, takeovers))
+    return dataclasses.replace(learner, takeover=ask(due, learner, key_decide, params))
+
+
+def _if_due(ask: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """`ask(learner, key, params)` where a decision is due, else the last decision.
+
+    Of runs that are stepped together all are asked where one has to be (a batched `cond` would ask
+    all of them in every step).
+    """
+
+    @jax.custom_batching.custom_vmap
+    def one(due: jax.Array, learner: Learner, key: jax.Array, params: PyTree) -> jax.Array:
+        return jax.lax.cond(
+            due, ask, lambda learner, key, params: learner.takeover, learner, key, params
+        )
+
+    @one.def_vmap
+    def many(
+        size: int, batched: Any, due: jax.Array, learner: Learner, key: jax.Array, params: PyTree
+    ) -> tuple[jax.Array, bool]:
+        asked, *axes = jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
+        del asked
+        last = jnp.broadcast_to(learner.takeover, (size,))
+        every = jax.vmap(ask, in_axes=tuple(axes), axis_size=size)
+        now = jax.lax.cond(jnp.any(due), every, lambda *_: last, learner, key, params)
+        return jnp.where(due, now, last), True
+
+    return one
+
+
+def takes_over(
+    problem: Problem, takeovers: Takeovers, learner: Learner, key: jax.Array, params: PyTree
+) -> jax.Array:
+    """The rule's answer, given what the novice proposes and where that leads."""
+    env, config, hparams = problem.env, problem.config, learner.hparams
+    key_predict, key_expert = jax.random.split(key)
     observation = env.observe(learner.env_state, params)
-    action = sample_novice_action(problem, learner, key_propose, observation)
+    action = propose(problem, learner, observation)
+    transition = transition_of(problem, hparams.predictor)
+    if config.noise_at != "pairs":
+        transition = imperfect(transition, hparams.prediction_noise)
     roll = functools.partial(
         predict,
         env,
-        transition_of(problem, learner.hparams.predictor),
+        transition,
         key_predict,
         learner.env_state,
         action=action,
         params=params,
-        horizon=problem.config.prediction_horizon,
+        horizon=config.prediction_horizon,
         observe=takeovers.needs_expert_rollout,
     )
-    act = functools.partial(problem.algorithm.act, learner.algorithm, key_act)
+    act = functools.partial(problem.algorithm.act, learner.algorithm)
     point = DecisionPoint(
         observation=observation,
         novice_action=action,
@@ -177,29 +219,33 @@ def decide(problem: Problem, takeovers: Takeovers, learner: Learner, key: jax.Ar
         experts=roll(expert=problem.expert) if takeovers.needs_expert_rollout else None,
         log_density=jnp.asarray(takeovers.log_density(observation, jnp.clip(action, -1.0, 1.0))),
     )
-    return takeovers.rule(learner.algorithm, point, learner.hparams)
+    return takeovers.rule(learner.algorithm, point, hparams)
 
 
 def block(problem: Problem, takeovers: Takeovers, learner: Learner) -> tuple[Learner, Metrics]:
-    """One decision and the K steps that it holds for, each followed by an update.
+    """K steps, each followed by an update, with a decision at the first of them.
 
-    Methods that learn in rounds (`Algorithm.update_every`) make their updates in
-    `round_of_blocks`.
+    A takeover ends with its episode; the next one's first step has a decision of its own, which
+    holds to the end of the block. Methods that learn in rounds (`Algorithm.update_every`) make
+    their updates in `round_of_blocks`.
     """
     algorithm, interval = problem.algorithm, problem.config.decision_interval
-    key, key_decide = jax.random.split(learner.key)
-    was_expert = learner.takeover
-    takeover = decide(problem, takeovers, learner, key_decide)
-    learner = dataclasses.replace(learner, takeover=takeover, key=key)
 
-    def step(learner: Learner, started: jax.Array) -> tuple[Learner, Metrics]:
-        learner, _ = interact(problem, learner, started)
+    def step(
+        carry: tuple[Learner, jax.Array], first: jax.Array
+    ) -> tuple[tuple[Learner, jax.Array], Metrics]:
+        learner, restarted = carry
+        before = learner.takeover
+        learner = decide(problem, takeovers, learner, first | restarted)
+        learner, made = interact(problem, learner, ~before)
+        carry = learner, made.terminated | made.truncated
         if algorithm.update_every > 1:
-            return learner, {}
-        return learn(learner, algorithm.update)
+            return carry, {}
+        learner, metrics = learn(learner, algorithm.update)
+        return (learner, carry[1]), metrics
 
-    first = jnp.arange(interval) == 0
-    learner, metrics = jax.lax.scan(step, learner, first & ~was_expert)
+    start = learner, jnp.zeros((), bool)
+    (learner, _), metrics = jax.lax.scan(step, start, jnp.arange(interval) == 0)
     return learner, jax.tree.map(jnp.mean, metrics)
 
 

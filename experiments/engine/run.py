@@ -37,8 +37,10 @@ from experiments.engine.settings import (
     check,
     one_level,
     refuse_contradictions,
+    schema_of,
 )
 from ppl_jax import algorithms, checkpoint, experts
+from ppl_jax.cards import card
 from ppl_jax.experts import SavedPolicy
 from ppl_jax.interaction import Counters, Learner
 from ppl_jax.networks import Layers
@@ -62,11 +64,14 @@ def build_env(settings: RunSettings) -> Env:
     Raises:
         UserError: If a scenario folder or the physics cannot be used.
     """
-    options = {
+    options: dict[str, Any] = {
         name: value
         for name in ("scenarios", "held_out_scenarios")
         if (value := getattr(settings, name)) is not None
     }
+    numbers = card(settings.env).sets.get(settings.evaluate_on)
+    if numbers is not None:
+        options["held_out"] = numbers
     return make_env(settings.env, {"physics": settings.config.physics, **options})
 
 
@@ -213,25 +218,36 @@ _OLD_HPARAMS = (  # of a learner's checkpoint before config.json had a schema
     "survival_correction",
 )
 _OLD_COUNTERS = {"physics_diverged": "broken"}
+_LATER = ("laplace_scale", "laplace_core", "human_cost_steps")  # since schema 5
 
 
 def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
     """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none.
 
-    A checkpoint from before config.json had a schema holds settings and counters under other names.
+    A checkpoint of before schema 5 lacks the settings and counters of since, and from before
+    config.json had a schema it holds them under other names.
     """
-    if "hparams" in folder.config() and hasattr(learner, "counters"):
-        names = {f.name: _OLD_COUNTERS.get(f.name, f.name) for f in dataclasses.fields(Counters)}
-        zero = jax.numpy.zeros((), jax.numpy.float32)
+    if hasattr(learner, "counters") and (schema := schema_of(folder.config())) < 5:
+        names = {f.name: f.name for f in dataclasses.fields(Counters) if f.name not in _LATER}
+        hparams: dict[str, Any] = {
+            f.name: getattr(learner.hparams, f.name)
+            for f in dataclasses.fields(learner.hparams)
+            if f.name not in _LATER
+        }
+        if schema == 1:
+            names |= _OLD_COUNTERS
+            zero = jax.numpy.zeros((), jax.numpy.float32)
+            hparams = {name: zero for name in _OLD_HPARAMS}
         old = dataclasses.replace(
             learner,
-            hparams=record_of(dict.fromkeys(_OLD_HPARAMS, zero)),
+            hparams=record_of(hparams),
             counters=record_of({then: getattr(learner.counters, n) for n, then in names.items()}),
         )
         done, found = _restore(folder, old)
         if found is old:
             return 0, learner
-        counters = Counters(**{n: getattr(found.counters, then) for n, then in names.items()})
+        held = {name: getattr(found.counters, then) for name, then in names.items()}
+        counters = dataclasses.replace(learner.counters, **held)
         return done, dataclasses.replace(found, hparams=learner.hparams, counters=counters)
     return _restore(folder, learner)
 
@@ -319,6 +335,7 @@ class _Runner:
             "seed": settings.seed,
             "total_steps": settings.config.total_steps,
             "human_data_usage": human,
+            "human_cost_steps": int(learner.counters.human_cost_steps),
             "intervention_rate": human / settings.config.total_steps,
             **scores,
             "training_episodes": int(learner.counters.episodes),

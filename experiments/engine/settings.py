@@ -11,10 +11,12 @@ import numpy as np
 from envs.registry import check_physics, known, unknown
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
+from ppl_jax.cards import card
 from ppl_jax.config import (
     HParams,
     TrainConfig,
     catalogue,
+    did_you_mean,
     replace,
     validate,
     values,
@@ -25,8 +27,8 @@ from ppl_jax.losses import NEEDS_REFERENCE
 from ppl_jax.predictors import predictor
 
 # of config.json; 1 had separate "config" and "hparams" under older names, 2 smaller buffers, 3 no
-# pairs at s_t where `pair_states` is "predicted"
-SCHEMA = 4
+# pairs at s_t where `pair_states` is "predicted", 4 no decision at the start of an episode
+SCHEMA = 5
 MAX_SEED = 2**32 - 1
 
 RENAMED = {
@@ -37,7 +39,16 @@ RENAMED_VALUES = {
     "gate": {"departs": "deviates_from_expert", "unlikely": "action_probability"},
 }
 # settings that older files lack, and the value that those runs had
-ADDED = {"physics": "auto", "randomise": False}
+ADDED = {
+    "physics": "auto",
+    "randomise": False,
+    "noise_at": "pairs",
+    "policy": "deterministic",
+    "laplace_scale": 0.1,
+    "laplace_core": 0.1,
+    "give_up_after": 0.0,
+    "recency": 0.0,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +62,8 @@ class RunSettings:
             `experiments.ui`) or "recorded PATH" of such a session.
         reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
-        evaluate_on: "held_out" or (to choose settings by) "training".
+        evaluate_on: "held_out", or (to choose settings by) "training", or a set that the
+            environment's card names.
         evaluate_every: Steps between evaluations (and checkpoints), after any demonstrations.
     """
 
@@ -320,6 +332,7 @@ def check(settings: RunSettings) -> None:
             f"evaluate_every must be a positive multiple of decision_interval ({interval}), got "
             f"{settings.evaluate_every}"
         )
+    _check_evaluate_on(settings)
     objective = getattr(settings.config.method, "objective", None)
     needs = objective in NEEDS_REFERENCE
     if needs and settings.reference_policy is None:
@@ -331,4 +344,20 @@ def check(settings: RunSettings) -> None:
         raise UserError(
             f"reference_policy is for ppl with objective {' or '.join(NEEDS_REFERENCE)}, got "
             f"{settings.algorithm} with {objective}"
+        )
+
+
+def _check_evaluate_on(settings: RunSettings) -> None:
+    sets = card(settings.env).sets
+    allowed = ("held_out", "training", *sets)
+    if settings.evaluate_on not in allowed:
+        raise UserError(
+            f"evaluate_on must be one of {', '.join(allowed)} for {settings.env}, got "
+            f"{settings.evaluate_on!r}{did_you_mean(settings.evaluate_on, allowed)}"
+        )
+    recorded = settings.scenarios is not None or settings.held_out_scenarios is not None
+    if settings.evaluate_on in sets and recorded:
+        raise UserError(
+            f"evaluate_on {settings.evaluate_on} is a set of generated scenarios: leave scenarios "
+            "and held_out_scenarios out, or evaluate on held_out"
         )

@@ -22,6 +22,7 @@ from ppl_jax.algorithms.pvp import PVPHParams, make_pvp, make_pvp4real
 from ppl_jax.algorithms.registry import AlgorithmSpec, method, register, registered, settings
 from ppl_jax.algorithms.thrifty_dagger import ThriftyDAggerHParams, make_thrifty_dagger
 from ppl_jax.cards import EnvCard
+from ppl_jax.policies import ClonerConfig
 
 GAIL_STEPS = 1_000_000
 
@@ -77,6 +78,7 @@ register(
     make_bc,
     _bc,
     {"likelihood": "laplace"},
+    config=ClonerConfig,
     hparams=ClonerHParams,
     gated=False,
     grid=_FAST | _LIKELIHOOD,
@@ -97,6 +99,7 @@ register(
     "hg_dagger",
     make_hg_dagger,
     tuned={"likelihood": "laplace"},
+    config=ClonerConfig,
     hparams=ClonerHParams,
     grid=_FAST | _LIKELIHOOD,
     cost=0.57,
@@ -128,6 +131,7 @@ register(
     make_iwr,
     _warmed_up,
     {"likelihood": "laplace"},
+    config=ClonerConfig,
     grid=_FAST | _LIKELIHOOD,
     cost=0.57,
 )

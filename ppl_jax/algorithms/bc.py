@@ -19,8 +19,10 @@ from ppl_jax.fields import setting
 from ppl_jax.gates import never
 from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
-from ppl_jax.networks import Network, layers, make_policy
+from ppl_jax.policies import Novice, make_novice
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
+
+RECENCY = "r: the k-th oldest of n rows is drawn with a chance that grows as (k / n)^r."
 
 
 @flax.struct.dataclass
@@ -28,6 +30,7 @@ class ClonerHParams:
     """Traced settings of methods that only clone."""
 
     bc_weight: jax.Array | float = setting(1.0, "Weight of the behaviour-cloning loss.", low=0)
+    recency: jax.Array | float = setting(0.0, RECENCY, low=0)
 
 
 @flax.struct.dataclass
@@ -43,7 +46,7 @@ class ClonerState:
     human_buffer: RingBuffer
 
 
-def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> ClonerState:
+def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> ClonerState:
     """Before the first step."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     rows = config.human_rows
@@ -65,21 +68,21 @@ def cloning_loss(
     cloned: tuple[jax.Array, jax.Array],
     hparams: HParams,
     *,
-    policy: Network,
+    policy: Novice,
     config: TrainConfig,
 ) -> tuple[jax.Array, Metrics]:
     """bc_weight L_bc on a batch of observations [B, O] and expert actions [B, A]."""
     observation, action = cloned
-    mean = policy.apply(params, observation)
-    bc, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction)
+    output, likelihood = policy.output(params, observation), policy.likelihood(hparams)
+    bc, metrics = bc_loss(output, action, likelihood, config.bc_reduction)
     return hparams.method.bc_weight * bc, metrics
 
 
 def update(
-    state: ClonerState, key: jax.Array, hparams: HParams, *, policy: Network, config: TrainConfig
+    state: ClonerState, key: jax.Array, hparams: HParams, *, policy: Novice, config: TrainConfig
 ) -> tuple[ClonerState, Metrics]:
     """One step of Adam on a batch of the expert's steps."""
-    cloned = buffers.sample(state.human_buffer, key, config.batch_size)
+    cloned = buffers.sample(state.human_buffer, key, config.batch_size, hparams.method.recency)
     has_data = buffers.size(state.human_buffer) > 0
     loss = functools.partial(cloning_loss, policy=policy, config=config)
     grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, cloned, hparams)
@@ -108,13 +111,13 @@ def make_cloner(
         config: Static settings.
         decide: See `Algorithm.decide`.
     """
-    policy = make_policy(spec, config.hidden)
+    policy = make_novice(spec, config)
     return Algorithm(
         name=name,
         init=functools.partial(init_state, policy=policy, spec=spec, config=config),
-        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
+        act=lambda state, key, observation: policy.act(state.learned.params, key, observation),
         decide=decide,
         store=store,
         update=functools.partial(update, policy=policy, config=config),
-        policy=lambda state: layers(state.learned.average),
+        policy=lambda state: policy.layers(state.learned.average),
     )

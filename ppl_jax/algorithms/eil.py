@@ -15,11 +15,12 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.distributions import log_likelihood
+from ppl_jax.distributions import Likelihood
 from ppl_jax.fields import setting
 from ppl_jax.learned import ActorCritic, Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy
+from ppl_jax.policies import likelihood_of
 from ppl_jax.types import EnvSpec, Interaction
 
 OTHERS = 3  # uniform random actions that the expert's is held against
@@ -241,7 +242,7 @@ def actor_loss(
     *,
     bc_weight: jax.Array | float,
     networks: Networks,
-    likelihood: str,
+    likelihood: Likelihood,
 ) -> jax.Array:
     """L_mu of a batch; `critics` are the parameters of the values."""
     half = batch.expert_action.shape[0]
@@ -249,7 +250,7 @@ def actor_loss(
     weight = jnp.concatenate([jnp.ones(half), batch.weight * jnp.ones(half)])
     action = networks.policy.apply(params, observation)
     value = networks.critic.apply(critics, observation, action)[0]
-    cloned = jnp.mean(log_likelihood(action[:half], batch.expert_action, likelihood))
+    cloned = jnp.mean(likelihood.log_prob(action[:half], batch.expert_action))
     return -jnp.mean(weight * value) - bc_weight * cloned
 
 
@@ -270,7 +271,7 @@ def update(
             actor_loss,
             bc_weight=hparams.method.bc_weight,
             networks=networks,
-            likelihood=config.likelihood,
+            likelihood=likelihood_of(config, hparams),
         )
         grads = jax.grad(loss)(actor.params, critics.params, batch)
         return adam_step(actor, grads, hparams.learning_rate)

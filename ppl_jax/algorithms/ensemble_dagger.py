@@ -18,6 +18,7 @@ from ppl_jax.fields import setting
 from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.networks import Ensemble, ensemble_layers, make_ensemble
+from ppl_jax.policies import likelihood_of
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
 
@@ -92,6 +93,7 @@ def members_loss(
     observation: jax.Array,
     action: jax.Array,
     weight: jax.Array,
+    hparams: HParams,
     *,
     ensemble: Ensemble,
     config: TrainConfig,
@@ -102,11 +104,13 @@ def members_loss(
         params: The ensemble's.
         observation, action: [K, B, O], [K, B, A].
         weight: [K, B].
+        hparams: The likelihood's scale.
         ensemble: K members.
         config: Static settings.
     """
     mean = ensemble.each(params, observation)
-    each, metrics = bc_loss(mean, action, config.likelihood, config.bc_reduction, weight=weight)
+    likelihood = likelihood_of(config, hparams)
+    each, metrics = bc_loss(mean, action, likelihood, config.bc_reduction, weight=weight)
     return config.method.members * each, metrics  # a member's gradient is that of it alone
 
 
@@ -130,7 +134,9 @@ def clone_members(
     weight = jnp.take_along_axis(human.copies.T, rows, axis=1)
     weight = weight / jnp.maximum(jnp.mean(weight, -1, keepdims=True), 1e-9)
     loss = functools.partial(members_loss, ensemble=ensemble, config=config)
-    grads, metrics = jax.grad(loss, has_aux=True)(learned.params, observation, action, weight)
+    grads, metrics = jax.grad(loss, has_aux=True)(
+        learned.params, observation, action, weight, hparams
+    )
     return adam_step(learned, grads, hparams.learning_rate, count > 0), metrics
 
 

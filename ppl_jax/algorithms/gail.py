@@ -15,12 +15,13 @@ from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.distributions import gaussian_log_prob, log_likelihood
+from ppl_jax.distributions import gaussian_log_prob
 from ppl_jax.fields import setting
 from ppl_jax.gates import never
 from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy, make_raw
+from ppl_jax.policies import likelihood_of
 from ppl_jax.ppo.losses import advantages, clipped_loss
 from ppl_jax.types import EnvSpec, Interaction
 
@@ -339,7 +340,7 @@ def fit(
 
     def loss(params: Any) -> jax.Array:
         mean = networks.policy.apply(params["mean"], observation)
-        return -jnp.mean(log_likelihood(mean, action, config.likelihood))
+        return -jnp.mean(likelihood_of(config, hparams).log_prob(mean, action))
 
     value, grads = jax.value_and_grad(loss)(state.learned.policy.params)
     learned = dataclasses.replace(

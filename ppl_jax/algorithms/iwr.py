@@ -16,7 +16,7 @@ from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.learned import Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics, bc_loss
-from ppl_jax.networks import Network, layers, make_policy
+from ppl_jax.policies import Novice, make_novice
 from ppl_jax.types import EnvSpec, Interaction
 
 
@@ -33,7 +33,7 @@ class IWRState:
     steps: SplitBuffer
 
 
-def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> IWRState:
+def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> IWRState:
     """Before the first step."""
     item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
     rows = config.human_rows
@@ -53,25 +53,26 @@ def weighted_loss(
     params: Any,
     items: tuple[jax.Array, jax.Array],
     weight: jax.Array,
+    hparams: HParams,
     *,
-    policy: Network,
+    policy: Novice,
     config: TrainConfig,
 ) -> tuple[jax.Array, Metrics]:
     """Cloning of executed actions [B, A] at observations [B, O], weighted by [B]."""
     observation, action = items
-    mean = policy.apply(params, observation)
-    return bc_loss(mean, action, config.likelihood, config.bc_reduction, weight=weight)
+    output, likelihood = policy.output(params, observation), policy.likelihood(hparams)
+    return bc_loss(output, action, likelihood, config.bc_reduction, weight=weight)
 
 
 def update(
-    state: IWRState, key: jax.Array, hparams: HParams, *, policy: Network, config: TrainConfig
+    state: IWRState, key: jax.Array, hparams: HParams, *, policy: Novice, config: TrainConfig
 ) -> tuple[IWRState, Metrics]:
     """One step of Adam on a balanced batch."""
     items, weight = buffers.sample_split(state.steps, key, config.batch_size)
     # nothing is learnt before the expert has shown anything
     has_data = buffers.size(state.steps.human) > 0
     loss = functools.partial(weighted_loss, policy=policy, config=config)
-    grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, items, weight)
+    grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, items, weight, hparams)
     learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
     return dataclasses.replace(state, learned=learned), metrics
 
@@ -85,12 +86,12 @@ def make_iwr(spec: EnvSpec, config: TrainConfig) -> Algorithm:
     Without demonstrations at the start (`demonstrations`, in D_I) they are those of a policy that
     has learnt nothing.
     """
-    policy = make_policy(spec, config.hidden)
+    policy = make_novice(spec, config)
     return Algorithm(
         name="iwr",
         init=functools.partial(init_state, policy=policy, spec=spec, config=config),
-        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
+        act=lambda state, key, observation: policy.act(state.learned.params, key, observation),
         store=store,
         update=functools.partial(update, policy=policy, config=config),
-        policy=lambda state: layers(state.learned.average),
+        policy=lambda state: policy.layers(state.learned.average),
     )

@@ -14,6 +14,7 @@ import numpy as np
 
 from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm
+from ppl_jax.algorithms.bc import RECENCY
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
@@ -25,7 +26,7 @@ from ppl_jax.losses import (
     pair_likelihoods,
     preference_loss,
 )
-from ppl_jax.networks import Network, layers, make_policy
+from ppl_jax.policies import ClonerConfig, Novice, make_novice
 from ppl_jax.preference import preference_pairs
 from ppl_jax.types import EnvSpec, Interaction, PreferenceBatch
 
@@ -34,7 +35,7 @@ Reference = Callable[[jax.Array], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class PPLConfig:
+class PPLConfig(ClonerConfig):
     """Static settings of PPL."""
 
     max_preference_horizon: int = setting(10, "Largest L a run may use; L itself is traced.", low=1)
@@ -69,7 +70,7 @@ class PPLConfig:
     )
 
     def check(self, config: TrainConfig, hparams: HParams) -> None:
-        """Check L against the horizons.
+        """Check L against the horizons, and the policy against the objective.
 
         Raises:
             ValueError: One line naming field, value and what is allowed.
@@ -82,6 +83,11 @@ class PPLConfig:
         ):
             if (horizon > most).any():
                 raise ValueError(f"preference_horizon must not exceed {name} ({most}), got {shown}")
+        if self.objective in NEEDS_REFERENCE and self.policy != "deterministic":
+            raise ValueError(
+                f"policy must be deterministic with objective {self.objective}, whose reference "
+                f"policy has no density of its own, got {self.policy!r}"
+            )
 
 
 @flax.struct.dataclass
@@ -111,6 +117,7 @@ class PPLHParams:
         low=0,
         common=True,
     )
+    recency: jax.Array | float = setting(0.0, RECENCY, low=0)
 
 
 MOST_PAIRS = 10  # that preference_horizon "auto" may choose
@@ -163,7 +170,7 @@ class PPLState:
     horizon: horizon.Horizon | None
 
 
-def init_state(key: jax.Array, policy: Network, spec: EnvSpec, config: TrainConfig) -> PPLState:
+def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> PPLState:
     """Before the first step."""
     method, actions = config.method, None
     observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
@@ -250,14 +257,14 @@ def store(
     )
 
 
-def pair_actions(
-    pairs: PreferenceBatch, act: Callable[[jax.Array], jax.Array]
+def pair_outputs(
+    pairs: PreferenceBatch, output: Callable[[jax.Array], jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """A policy's actions where the preferred and where the rejected action belong, [B, A] each."""
-    at_preferred = act(pairs.observation)
+    """A policy's outputs where the preferred and where the rejected action belong, [B, D] each."""
+    at_preferred = output(pairs.observation)
     if pairs.rejected_observation is None:
         return at_preferred, at_preferred
-    return at_preferred, act(pairs.rejected_observation)
+    return at_preferred, output(pairs.rejected_observation)
 
 
 def ppl_loss(
@@ -267,7 +274,7 @@ def ppl_loss(
     has_pairs: jax.Array,
     *,
     hparams: HParams,
-    policy: Network,
+    policy: Novice,
     config: TrainConfig,
     reference: Reference | None = None,
 ) -> tuple[jax.Array, Metrics]:
@@ -286,18 +293,18 @@ def ppl_loss(
     observation, action = cloned
     weights, method = hparams.method, config.method
     # two separate forward passes: XLA runs them side by side on a CPU
-    bc, metrics = bc_loss(
-        policy.apply(params, observation), action, config.likelihood, config.bc_reduction
-    )
-    preferred_mean, rejected_mean = pair_actions(pairs, functools.partial(policy.apply, params))
+    likelihood = policy.likelihood(hparams)
+    output = policy.output(params, observation)
+    bc, metrics = bc_loss(output, action, likelihood, config.bc_reduction)
+    preferred, rejected = pair_outputs(pairs, functools.partial(policy.output, params))
     compared = pair_likelihoods(
-        preferred_mean,
+        preferred,
         pairs.preferred_action,
-        rejected_mean,
+        rejected,
         pairs.rejected_action,
         bias=weights.preference_bias,
-        likelihood=config.likelihood,
-        reference=pair_actions(pairs, reference) if reference is not None else None,
+        likelihood=likelihood,
+        reference=pair_outputs(pairs, reference) if reference is not None else None,
     )
     preference, more = preference_loss(
         compared,
@@ -315,14 +322,15 @@ def update(
     key: jax.Array,
     hparams: HParams,
     *,
-    policy: Network,
+    policy: Novice,
     config: TrainConfig,
     reference: Reference | None = None,
 ) -> tuple[PPLState, Metrics]:
     """One step of Adam on a batch from either data set."""
     key_human, key_pairs = jax.random.split(key)
-    cloned = buffers.sample(state.human_buffer, key_human, config.batch_size)
-    pairs = buffers.sample(state.preference_buffer, key_pairs, config.batch_size)
+    size, recency = config.batch_size, hparams.method.recency
+    cloned = buffers.sample(state.human_buffer, key_human, size, recency)
+    pairs = buffers.sample(state.preference_buffer, key_pairs, size, recency)
     has_data = buffers.size(state.human_buffer) > 0
     has_pairs = buffers.size(state.preference_buffer) > 0
     loss = functools.partial(
@@ -354,14 +362,14 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
     method = config.method
     if method.objective in NEEDS_REFERENCE and reference is None:
         raise ValueError(f"objective {method.objective!r} needs a reference policy")
-    policy = make_policy(spec, config.hidden)
+    policy = make_novice(spec, config)
     return Algorithm(
         name="ppl",
         init=functools.partial(init_state, policy=policy, spec=spec, config=config),
-        act=lambda state, key, observation: policy.apply(state.learned.params, observation),
+        act=lambda state, key, observation: policy.act(state.learned.params, key, observation),
         store=functools.partial(store, scale=jnp.asarray(spec.observation_scale), method=method),
         update=functools.partial(update, policy=policy, config=config, reference=reference),
-        policy=lambda state: layers(state.learned.average),
+        policy=lambda state: policy.layers(state.learned.average),
         predicted_steps=method.max_preference_horizon,
         labels_predictions=method.adaptive_horizon,
     )

@@ -16,11 +16,12 @@ from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.replay import ReplayStep, add_step, init_replay, td_loss, td_target
 from ppl_jax.buffers import SplitBuffer
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.distributions import log_likelihood
+from ppl_jax.distributions import Likelihood
 from ppl_jax.fields import setting
 from ppl_jax.learned import ActorCritic, Learned, adam_step, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import Network, layers, make_critic, make_policy
+from ppl_jax.policies import likelihood_of
 from ppl_jax.types import EnvSpec, Interaction
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5  # TD3's, on the target policy's action
@@ -139,12 +140,12 @@ def actor_loss(
     *,
     hparams: HParams,
     networks: Networks,
-    likelihood: str,
+    likelihood: Likelihood,
 ) -> jax.Array:
     """L_mu of a batch with weights [B]; `critics` are the parameters of the values."""
     action = networks.policy.apply(params, batch.observation)
     value = networks.critic.apply(critics, batch.observation, action)[0]
-    log_pi = log_likelihood(action, batch.expert_action, likelihood)
+    log_pi = likelihood.log_prob(action, batch.expert_action)
     return policy_loss(value, log_pi, batch.takeover, weight, bc_weight=hparams.method.bc_weight)
 
 
@@ -166,8 +167,12 @@ def update(
     )
 
     def improve(actor: Learned) -> Learned:
+        likelihood = likelihood_of(config, hparams)
         loss = functools.partial(
-            actor_loss, hparams=hparams, networks=networks, likelihood=config.likelihood
+            actor_loss,
+            hparams=hparams,
+            networks=networks,
+            likelihood=likelihood,
         )
         grads = jax.grad(loss)(actor.params, critics.params, batch, weight)
         return adam_step(actor, grads, hparams.learning_rate)

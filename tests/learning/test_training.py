@@ -1,12 +1,14 @@
 import dataclasses
 import re
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ppl_jax import algorithms, experts
+from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.algorithms.ppl import make_ppl
 from ppl_jax.config import replace, validate
 from ppl_jax.evaluation import make_evaluate
@@ -174,6 +176,7 @@ def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
             return super().transition(key, state, action, params)
 
     probe = Counting()
+    probe.tolerance = 3.0  # no episode ends, and with it no decision is due between the first ones
     config = dataclasses.replace(TINY, total_steps=5)
     gate = make_train(probe, probe.scripted_expert, make_ppl, config).algorithm
     # the expert takes over in the lanes whose observation shows +1
@@ -189,6 +192,108 @@ def test_lanes_without_a_takeover_do_not_pay_for_the_lookahead():
     assert 0 < taken < 8 * 5
     # two lookaheads of the gate in each lane, every step, and what the experts' steps look ahead
     assert len(calls) == 8 * (2 * 6 + 5) + 6 * taken
+
+
+ALWAYS = lambda state, point, hparams: jnp.ones((), bool)  # noqa: E731
+
+
+def test_every_episode_begins_with_a_decision():
+    """Episodes of 20 steps end within blocks of 7: not one step is left to the novice."""
+    probe, fns = functions(total_steps=140, decision_interval=7)
+    algorithm = fns.algorithm._replace(decide=ALWAYS)
+    config, _ = small(total_steps=140, decision_interval=7)
+    fns = make_train(probe, probe.scripted_expert, lambda spec, config: algorithm, config)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), HP)
+    assert int(learner.counters.human_data) == 140
+    assert int(learner.counters.takeovers) == int(learner.counters.episodes) == 7
+
+
+@flax.struct.dataclass
+class Heard:
+    """What the stub below was asked and shown."""
+
+    learned: jax.Array
+    proposals: jax.Array
+
+
+@pytest.mark.parametrize("random_steps", [0, 40])
+@pytest.mark.parametrize("together", [False, True])
+def test_the_gate_judges_the_action_that_is_then_executed(random_steps, together):
+    """A novice that draws actions says the same to the gate and in the step; so do random ones."""
+    probe = Probe()
+    probe.tolerance = 3.0
+    config, hparams = small(total_steps=40, decision_interval=1, random_steps=random_steps)
+
+    def make(spec, config):
+        return Algorithm(
+            name="stub",
+            init=lambda key: Heard(learned=jnp.zeros(1), proposals=jnp.zeros(())),
+            act=lambda state, key, observation: jax.random.uniform(key, (1,), minval=-1.0),
+            # the gate's view of the proposal is the takeover: compared with the step's below
+            decide=lambda state, point, hparams: point.novice_action[0] > 0,
+            store=lambda state, step, hparams: state.replace(
+                proposals=state.proposals + ((step.novice_action[0] > 0) != step.takeover)
+            ),
+            update=lambda state, key, hparams: (state, {"loss": jnp.zeros(())}),
+            policy=lambda state: [],
+        )
+
+    train = make_train(probe, probe.scripted_expert, make, config).train
+    if together:
+        keys = jax.random.split(jax.random.key(0), 3)
+        learners, _ = jax.jit(jax.vmap(train, in_axes=(0, None)))(keys, hparams)
+    else:
+        learners, _ = jax.jit(train)(jax.random.key(0), hparams)
+    assert float(jnp.sum(learners.algorithm.proposals)) == 0
+    assert np.all((learners.counters.human_data > 5) & (learners.counters.human_data < 35))
+
+
+class Costly(Probe):
+    """Every step costs."""
+
+    def transition(self, key, state, action, params):
+        state, outcome = super().transition(key, state, action, params)
+        return state, dataclasses.replace(outcome, cost=jnp.ones(()))
+
+
+@pytest.mark.parametrize(("patience", "episodes"), [(0, 6), (3, 40), (50, 6)])
+def test_a_hopeless_episode_may_be_given_up(patience, episodes):
+    world, config = Costly(), dataclasses.replace(TINY, total_steps=120)
+    gate = make_ppl(world.spec, config)._replace(decide=ALWAYS)
+    fns = make_train(world, world.scripted_expert, lambda *_: gate, config)
+    learner, _ = jax.jit(fns.train)(jax.random.key(0), set_to(HP, give_up_after=patience))
+    counters = learner.counters
+    assert int(counters.human_cost_steps) == int(counters.human_data) == 120
+    assert int(counters.episodes) == episodes
+    assert int(counters.successes) == (episodes if patience != 3 else 0)
+
+
+@pytest.mark.parametrize("noise_at", ["pairs", "gate", "both"])
+def test_prediction_noise_goes_where_it_is_told(noise_at):
+    """At the gate it changes what the prediction says, in the pairs what they are about."""
+    probe = Probe()
+    config, hparams = small(total_steps=5, noise_at=noise_at)  # a single decision
+    outcome = {}
+    for epsilon in (0.0, 1.0):
+        seen = []
+
+        def decide(state, point, hparams, seen=seen):
+            jax.debug.callback(lambda x: seen.append(np.array(x)), point.trajectory.observation)
+            return jnp.ones((), bool)
+
+        algorithm = make_ppl(probe.spec, config)._replace(decide=decide, needs_expert_rollout=True)
+        fns = make_train(probe, probe.scripted_expert, lambda *_, a=algorithm: a, config)
+        learner, _ = jax.jit(fns.train)(
+            jax.random.key(0), set_to(hparams, prediction_noise=epsilon)
+        )
+        jax.effects_barrier()
+        pairs = learner.algorithm.preference_buffer
+        outcome[epsilon] = np.array(seen), np.asarray(pairs.data.observation)[: int(pairs.added)]
+    (gate, pairs), (noisy_gate, noisy_pairs) = outcome[0.0], outcome[1.0]
+    assert np.array_equal(gate, noisy_gate) is (noise_at == "pairs")
+    signs = np.abs(noisy_pairs[:, 0])  # +1 or -1 unless disturbed
+    assert np.allclose(signs, 1.0) is (noise_at == "gate")
+    assert np.allclose(np.abs(pairs[:, 0]), 1.0)
 
 
 def test_chunks_are_the_whole_run_bit_for_bit():

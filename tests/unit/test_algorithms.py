@@ -12,9 +12,9 @@ from ppl_jax import buffers
 from ppl_jax.algorithms import eil, gail, haco, ppl, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
 from ppl_jax.config import HParams
+from ppl_jax.distributions import surrogate
 from ppl_jax.experts import SavedPolicy, act
 from ppl_jax.networks import (
-    Network,
     ensemble_layers,
     layers,
     make_critic,
@@ -22,6 +22,7 @@ from ppl_jax.networks import (
     make_policy,
     make_raw,
 )
+from ppl_jax.policies import Novice
 from ppl_jax.types import PreferenceBatch
 from tests.helpers import Probe, plain_settings, probe_settings
 
@@ -178,7 +179,13 @@ def test_gail_losses():
 def test_ppl_sums_both_losses_by_their_weights():
     """With the terms one by one; without pairs only cloning is left."""
     config, hparams = plain_settings("ppl", beta=0.3, bc_weight=0.7, preference_weight=2.0)
-    policy = Network(init=lambda key: None, apply=lambda params, observation: params + observation)
+    policy = Novice(
+        init=lambda key: None,
+        output=lambda params, observation: params + observation,
+        act=lambda params, key, observation: observation,
+        likelihood=lambda hparams: surrogate("gaussian"),
+        layers=lambda params: [],
+    )
     means, expert, good, bad = (uniform(B, A) for _ in range(4))
     pairs = PreferenceBatch(
         observation=means, preferred_action=good, rejected_action=bad, rejected_observation=None

@@ -44,9 +44,24 @@ def test_samples_come_from_what_is_held_and_evenly():
     assert counts.min() > 850
 
 
+@pytest.mark.parametrize("count", [3, 5, 8])
+@pytest.mark.parametrize("recency", [0.0, 1.0, 3.0])
+def test_recent_items_are_drawn_more_often(count, recency):
+    """Also once the buffer of 5 rows has gone round."""
+    buffer = buffers.init_buffer(jnp.zeros(()), 5)
+    for value in range(count):
+        buffer = ADD(buffer, jnp.full(4, float(value)), jnp.arange(4) == 0)
+    drawn = np.asarray(buffers.sample(buffer, jax.random.key(0), 20_000, recency))
+    held = min(count, 5)
+    share = (np.arange(held + 1) / held) ** (1 + recency)
+    found = [np.mean(drawn == value) for value in range(count - held, count)]
+    np.testing.assert_allclose(found, np.diff(share), atol=0.015)
+
+
 def test_an_empty_buffer_gives_zeros():
     buffer = buffers.init_buffer(jnp.zeros(3), 5)
-    assert not np.asarray(buffers.sample(buffer, jax.random.key(0), 4)).any()
+    for recency in (None, 2.0):
+        assert not np.asarray(buffers.sample(buffer, jax.random.key(0), 4, recency)).any()
 
 
 def test_written_in_place_inside_a_scan():

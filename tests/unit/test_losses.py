@@ -6,7 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppl_jax.distributions import gaussian_log_prob, log_likelihood, squashed_gaussian
+from ppl_jax.distributions import (
+    EDGE,
+    SQUASHED,
+    gaussian_log_prob,
+    log_likelihood,
+    mean_and_log_std,
+    squashed_gaussian,
+    squashed_log_prob,
+    surrogate,
+)
 from ppl_jax.losses import bc_loss, pair_likelihoods, preference_loss
 
 RNG = np.random.default_rng(0)
@@ -143,6 +152,62 @@ def test_gradients_are_finite_at_the_corners_of_the_action_box(kind):
             )
             assert bool(jnp.all(jnp.isfinite(gradient)))
         assert bool(jnp.all(jnp.isfinite(jax.grad(lambda m: bc_loss(m, corner, kind)[0])(mean))))
+
+
+OUTPUTS = RNG.normal(0, 1.5, (7, 6)).astype(np.float32)
+
+
+def test_a_squashed_density_is_that_of_its_samples_and_adds_up_to_one():
+    mean, log_std = mean_and_log_std(OUTPUTS)
+    assert float(log_std.min()) > -5.0
+    assert float(log_std.max()) < 2.0
+    sample, expected = squashed_gaussian(jax.random.key(0), 0.3 * mean, log_std)
+    shrunk = np.concatenate([0.3 * OUTPUTS[:, :3], OUTPUTS[:, 3:]], -1)
+    inside = np.all(np.abs(sample) < 1 - EDGE, -1)
+    assert inside.sum() >= 3
+    np.testing.assert_allclose(
+        squashed_log_prob(shrunk, sample)[inside], expected[inside], rtol=1e-3, atol=1e-3
+    )
+    u = np.linspace(-9, 9, 20_001)  # the integral over the box, in the variable that has no edge
+    for center, spread in ((0.0, 0.0), (0.8, -1.0), (-0.5, -0.6)):
+        outputs = np.tile(np.float32([center, spread]), (len(u), 1))
+        density = np.exp(squashed_log_prob(outputs, np.tanh(u)[:, None].astype(np.float32)))
+        kept = np.abs(np.tanh(u)) < 1 - EDGE
+        total = np.trapezoid((density * (1 - np.tanh(u) ** 2))[kept], u[kept])
+        std = np.exp(mean_and_log_std(outputs[0])[1][0])
+        reach = np.arctanh(1 - EDGE)
+        tails = 0.5 * sum(math.erfc((reach + s * center) / (std * 2**0.5)) for s in (1, -1))
+        assert total == pytest.approx(1 - tails, abs=2e-3)
+
+
+def test_a_squashed_density_is_finite_at_the_edge_of_the_box():
+    for action in (np.ones((7, 3)), -np.ones((7, 3)), np.float32(GOOD)):
+        for scale in (1.0, 30.0):
+            action = np.float32(action)
+            value, gradient = jax.value_and_grad(
+                lambda out, a=action: (
+                    cpo_loss(out, a, out, BAD, 0.1, 1.0, SQUASHED)[0] + bc_loss(out, a, SQUASHED)[0]
+                )
+            )(scale * OUTPUTS)
+            assert np.isfinite(value)
+            assert np.all(np.isfinite(gradient))
+
+
+def test_the_output_that_attains_an_action_is_most_likely_to_give_it():
+    there = SQUASHED.attaining(OUTPUTS, 0.9 * GOOD)
+    mean, log_std = mean_and_log_std(there)
+    np.testing.assert_allclose(np.tanh(mean), 0.9 * GOOD, atol=1e-5)
+    np.testing.assert_array_equal(log_std, mean_and_log_std(OUTPUTS)[1])
+    np.testing.assert_array_equal(surrogate("laplace").attaining(MEAN, GOOD), GOOD)
+
+
+def test_the_laplace_likelihood_has_its_scale_and_core():
+    value = log_likelihood(MEAN, GOOD, "laplace", scale=0.3, core=0.5)
+    square = np.sum((MEAN - GOOD) ** 2, -1)
+    np.testing.assert_allclose(value, -(np.sqrt(square + 0.25) - 0.5) / 0.3, rtol=1e-5)
+    assert float(bc_loss(MEAN, GOOD, surrogate("laplace", 0.3, 0.5))[0]) == pytest.approx(
+        -float(np.mean(value)), rel=1e-6
+    )
 
 
 PAIRS = pair_likelihoods(MEAN, GOOD, MEAN, BAD)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ppl_jax.config import NoHParams
-from ppl_jax.predictors import add_noise, predict
+from ppl_jax.predictors import add_noise, imperfect, predict
 from ppl_jax.predictors import predictor as named
 
 H = 8
@@ -54,6 +54,31 @@ def test_a_prediction_is_the_transition_in_a_loop_and_leaves_no_trace(world, sta
             np.testing.assert_allclose(predicted.reward[i], outcome.reward, atol=2e-4)
             assert bool(predicted.unsafe[i]) == bool(outcome.unsafe)
         np.testing.assert_allclose(predicted.observation[i], observe(state), atol=2e-4)
+
+
+def test_an_imperfect_step_is_off_by_a_share_of_what_changes(world, start):
+    params, action = world.default_params, jnp.array([0.1, 0.2])
+
+    @jax.jit
+    def steps(state, epsilon):
+        off = imperfect(world.transition, epsilon)(jax.random.key(3), state, action, params)
+        return world.transition(None, state, action, params), off
+
+    for epsilon in (0.0, 0.25):
+        (exact, outcome), (off, same) = steps(start, epsilon)
+        for a, b in zip(jax.tree.leaves(outcome), jax.tree.leaves(same), strict=True):
+            np.testing.assert_array_equal(a, b)
+        moved = 0
+        parts = zip(*map(jax.tree.leaves, (start, exact, off)), strict=True)
+        for before, after, wrong in parts:
+            if not np.issubdtype(after.dtype, np.floating):
+                np.testing.assert_array_equal(after, wrong)
+                continue
+            changed = np.linalg.norm(np.ravel(after - before))
+            error = np.linalg.norm(np.ravel(wrong - after))
+            assert error == pytest.approx(epsilon * changed, rel=1e-3, abs=1e-4)
+            moved += changed > 1e-3
+        assert moved >= 4
 
 
 def test_the_real_step_is_the_same_with_and_without_a_prediction(world, start):

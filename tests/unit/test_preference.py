@@ -31,7 +31,7 @@ def point(novice, experts=None):
     )
 
 
-def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=()):
+def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=(), clearance=9.0):
     def at(steps):
         return jnp.isin(jnp.arange(M), jnp.array(list(steps), int))
 
@@ -44,6 +44,7 @@ def trajectory(valid=M, reward=1.0, speed=10.0, unsafe=(), success=(), ended=())
         success=at(success),
         terminated=at(ended),
         valid=steps,
+        clearance=jnp.full(M, clearance),
     )
 
 
@@ -109,13 +110,16 @@ def test_changing_the_horizon_compiles_nothing():
         ({"speed": 4.0}, True),
         ({"speed": 4.0, "success": [2], "valid": 3}, False),
         ({"valid": 2, "speed": 6.0}, False),
+        ({"clearance": 0.4}, True),
+        ({"clearance": 0.6}, False),
+        ({"speed": np.linspace(1.0, 4.0, M)}, False),
+        ({"speed": np.linspace(1.0, 2.5, M)}, True),
+        ({"speed": np.linspace(1.0, 4.0, M), "unsafe": [1]}, True),
     ],
 )
 def test_the_driving_gate(case, expected):
-    assert (
-        bool(unsafe_or_slow(point(trajectory(**case)), UnsafeOrSlowHParams(min_speed=5.0), SCALE))
-        is expected
-    )
+    hparams = UnsafeOrSlowHParams(min_speed=5.0, min_clearance=0.5, min_gain=2.0)
+    assert bool(unsafe_or_slow(point(trajectory(**case)), hparams, SCALE)) is expected
 
 
 @pytest.mark.parametrize(

@@ -138,8 +138,8 @@ def test_a_config_of_the_first_version_is_read_under_todays_names():
 
 def test_a_config_of_a_newer_version_or_with_unknown_settings_is_refused():
     content = RunSettings.from_json(old_config("ppl")).as_json()
-    with pytest.raises(UserError, match="schema 5; this version reads up to 4"):
-        RunSettings.from_json(content | {"schema": 5})
+    with pytest.raises(UserError, match="schema 6; this version reads up to 5"):
+        RunSettings.from_json(content | {"schema": 6})
     content["settings"]["beat"] = 1.0
     with pytest.raises(UserError, match="unknown setting 'beat': did you mean 'beta'"):
         RunSettings.from_json(content)
