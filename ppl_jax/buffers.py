@@ -65,28 +65,31 @@ def add(buffer: RingBuffer, items: PyTree, mask: jax.Array) -> RingBuffer:
     return RingBuffer(data=data, next=(buffer.next + count) % rows, added=buffer.added + count)
 
 
-def sample(
-    buffer: RingBuffer, key: jax.Array, count: int, recency: jax.Array | float | None = None
-) -> PyTree:
-    """`count` items drawn with replacement.
+def draw(
+    buffer: RingBuffer, key: jax.Array, shape: tuple[int, ...], recency: jax.Array | float = 0.0
+) -> jax.Array:
+    """Rows drawn with replacement, all alike or recent ones more often.
 
-    An empty buffer returns zeros; mask the loss.
+        P(k-th oldest of n) = (k / n)^(1 + r) - ((k - 1) / n)^(1 + r)
 
     Args:
-        buffer: To draw from.
+        buffer: To draw from; row 0 where it is empty.
         key: Random key.
-        count: Number of items.
-        recency: r: of n items the k-th oldest is drawn with a probability that grows as (k / n)^r;
-            all alike where None.
+        shape: Of the result.
+        recency: r; 0 draws all alike.
     """
     held = size(buffer)
-    if recency is None:
-        index = jax.random.randint(key, (count,), 0, jnp.maximum(held, 1))
-    else:
-        rank = held * jax.random.uniform(key, (count,)) ** (1.0 / (1.0 + recency))
-        rank = jnp.clip(rank.astype(jnp.int32), 0, jnp.maximum(held - 1, 0))
-        index = (buffer.next - held + rank) % capacity(buffer)
-    return jax.tree.map(lambda leaf: leaf[index], buffer.data)
+    rank = held * jax.random.uniform(key, shape) ** (1.0 / (1.0 + recency))
+    rank = jnp.clip(rank.astype(jnp.int32), 0, jnp.maximum(held - 1, 0))
+    return (buffer.next - held + rank) % capacity(buffer)
+
+
+def sample(
+    buffer: RingBuffer, key: jax.Array, count: int, recency: jax.Array | float = 0.0
+) -> PyTree:
+    """`count` items; see `draw`. An empty buffer returns zeros; mask the loss."""
+    rows = draw(buffer, key, (count,), recency)
+    return jax.tree.map(lambda leaf: leaf[rows], buffer.data)
 
 
 @flax.struct.dataclass
@@ -118,8 +121,16 @@ def add_split(split: SplitBuffer, item: PyTree, takeover: jax.Array) -> SplitBuf
     )
 
 
-def sample_split(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
+def sample_split(
+    split: SplitBuffer, key: jax.Array, count: int, recency: jax.Array | float = 0.0
+) -> tuple[PyTree, jax.Array]:
     """`count` items, one half from either buffer (human first), and their weights.
+
+    Args:
+        split: To draw from.
+        key: Random key.
+        count: Number of items.
+        recency: See `draw`.
 
     Returns:
         Items and [count] weights of mean 1: all 1 where both buffers hold something; where one is
@@ -127,8 +138,8 @@ def sample_split(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree
     """
     key_human, key_robot = jax.random.split(key)
     half = count // 2
-    ours = sample(split.human, key_human, half)
-    theirs = sample(split.robot, key_robot, count - half)
+    ours = sample(split.human, key_human, half, recency)
+    theirs = sample(split.robot, key_robot, count - half, recency)
     items = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ours, theirs)
     held = jnp.where(jnp.arange(count) < half, size(split.human), size(split.robot)) > 0
     return items, held / jnp.maximum(jnp.mean(held), 1e-9)

@@ -39,8 +39,8 @@ class HParams:
     """Traced settings: leaves of one pytree, so any of them may carry a batch axis.
 
     Attributes:
-        learning_rate, expert_noise, prediction_noise, give_up_after, laplace_scale, laplace_core:
-            See the fields' own text.
+        learning_rate, expert_noise, prediction_noise, recency, give_up_after, laplace_scale,
+            laplace_core: See the fields' own text.
         method, gate, predictor: Traced settings that these own.
         world: The ranges that worlds are drawn within; `NoHParams` where they are not randomised.
     """
@@ -60,6 +60,14 @@ class HParams:
         "epsilon: predicted observations s get noise e with |e| = epsilon |s|; see noise_at.",
         low=0,
         group="predictor",
+        common=True,
+    )
+    recency: jax.Array | float = setting(
+        0.0,
+        "How much more often recent expert steps (and their pairs) are learned from: the k-th "
+        "oldest of n with a chance that grows as (k / n)^recency. GAIL and haco_port have none.",
+        low=0,
+        group="run",
         common=True,
     )
     give_up_after: jax.Array | float = setting(

@@ -218,7 +218,17 @@ _OLD_HPARAMS = (  # of a learner's checkpoint before config.json had a schema
     "survival_correction",
 )
 _OLD_COUNTERS = {"physics_diverged": "broken"}
-_LATER = ("laplace_scale", "laplace_core", "human_cost_steps")  # since schema 5
+# settings, counters and further parts of a learner since schema 5
+_LATER = (
+    "laplace_scale",
+    "laplace_core",
+    "give_up_after",
+    "recency",
+    "min_clearance",
+    "min_gain",
+    "human_cost_steps",
+    "costly",
+)
 
 
 def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
@@ -229,27 +239,35 @@ def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
     """
     if hasattr(learner, "counters") and (schema := schema_of(folder.config())) < 5:
         names = {f.name: f.name for f in dataclasses.fields(Counters) if f.name not in _LATER}
-        hparams: dict[str, Any] = {
-            f.name: getattr(learner.hparams, f.name)
-            for f in dataclasses.fields(learner.hparams)
-            if f.name not in _LATER
-        }
+        hparams = _without_later(learner.hparams)
         if schema == 1:
             names |= _OLD_COUNTERS
             zero = jax.numpy.zeros((), jax.numpy.float32)
-            hparams = {name: zero for name in _OLD_HPARAMS}
-        old = dataclasses.replace(
-            learner,
-            hparams=record_of(hparams),
-            counters=record_of({then: getattr(learner.counters, n) for n, then in names.items()}),
-        )
+            hparams = record_of({name: zero for name in _OLD_HPARAMS})
+        parts = {f.name: getattr(learner, f.name) for f in dataclasses.fields(learner)}
+        counted = {then: getattr(learner.counters, name) for name, then in names.items()}
+        parts |= {"hparams": hparams, "counters": record_of(counted)}
+        old = record_of({name: part for name, part in parts.items() if name not in _LATER})
         done, found = _restore(folder, old)
         if found is old:
             return 0, learner
         held = {name: getattr(found.counters, then) for name, then in names.items()}
         counters = dataclasses.replace(learner.counters, **held)
-        return done, dataclasses.replace(found, hparams=learner.hparams, counters=counters)
+        found = {name: getattr(found, name) for name in parts if name not in _LATER}
+        found |= {"hparams": learner.hparams, "counters": counters}
+        return done, dataclasses.replace(learner, **found)
     return _restore(folder, learner)
+
+
+def _without_later(settings: Any) -> Any:
+    """A record of traced settings as it was before schema 5, its owners' within it too."""
+    fields = {f.name: getattr(settings, f.name) for f in dataclasses.fields(settings)}
+    kept = {
+        name: _without_later(value) if dataclasses.is_dataclass(value) else value
+        for name, value in fields.items()
+        if name not in _LATER
+    }
+    return record_of(kept) if kept else settings
 
 
 def record_of(values: Mapping[str, Any]) -> Any:

@@ -48,6 +48,8 @@ ADDED = {
     "laplace_core": 0.1,
     "give_up_after": 0.0,
     "recency": 0.0,
+    "min_clearance": 0.0,
+    "min_gain": 100.0,
 }
 
 

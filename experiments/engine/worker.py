@@ -132,6 +132,7 @@ def _rows(looks: list[Look], numbers: Any) -> Reply:
             "step": look.step,
             "status": "diverged" if look.diverged else "done",
             "human_data_usage": counters["human_data"],
+            "human_cost_steps": counters["human_cost_steps"],
             "takeovers": counters["takeovers"],
             "training_cost": f"{counters['cost']:g}",
         }
@@ -139,7 +140,7 @@ def _rows(looks: list[Look], numbers: Any) -> Reply:
     return {"rows": rows, "episodes": [row._asdict() for row in last]}
 
 
-_COUNTED = ("human_data", "takeovers", "cost")
+_COUNTED = ("human_data", "human_cost_steps", "takeovers", "cost")
 _SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -104,18 +105,23 @@ class Ablation:
 @hide_unset
 @dataclasses.dataclass
 class Tune:
-    """Try the declared grid of every method, on training scenarios; one table."""
+    """Search settings for every method alike, in two rounds, on tuning scenarios; one table.
+
+    It resumes.
+    """
 
     env: Positional[str]
     """Environment; `ppl list` names them."""
     algorithms: tuple[str, ...] = ()
     """Methods (default: all)."""
-    seeds: Seeds = tuple(range(2))
-    """How many (5), which (3 7 11) or a range (10-19)."""
-    total_steps: int = 3000
-    """Environment steps of each run (bc keeps its own)."""
-    evaluate_every: int = 1000
-    """Steps between evaluations."""
+    seeds: Seeds = (0, 1)
+    """Of the first round: how many (5), which (3 7 11) or a range (10-19)."""
+    final_seeds: Seeds = (2, 3, 4, 5)
+    """Of the second round, fresh ones."""
+    total_steps: int | None = None
+    """Environment steps of each run (bc and gail keep their own)."""
+    evaluate_every: int | None = None
+    """Steps between evaluations (default: a fifth of the run)."""
     gail_steps: int = 120_000
     """Environment steps of gail."""
     batch_size: int | None = None
@@ -124,7 +130,7 @@ class Tune:
     """Physics engine of the environment (default: auto); `ppl list` names them."""
     expert: str | None = None
     """scripted (the default), neural (the shipped one), or a policy file or run folder."""
-    processes: int = 2
+    processes: int = os.cpu_count() or 1
     """Runs at the same time; as many as there are cores get one each."""
     out: Path = Path("tune")
     """Folder of the runs and of tuning.csv; finished runs in it are kept."""

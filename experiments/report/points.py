@@ -21,7 +21,7 @@ from ppl_jax.statistics import Interval, mean_interval, paired_difference
 Frame: TypeAlias = Any  # pandas.DataFrame: pandas is imported when it is used
 RESULTS, EPISODES = "results.csv", "episodes.csv"
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
-COUNTS = ("human_data_usage", "takeovers", "training_cost")
+COUNTS = ("human_data_usage", "human_cost_steps", "takeovers", "training_cost")
 MEASURED = (*COUNTS, *SCORES)
 _NOT_SETTINGS = {"run", "env", "algorithm", "seed", "status", "step", "total_steps", *MEASURED}
 _NOT_SETTINGS |= {"scenario", "engine", "wall_s", "compile_s"}

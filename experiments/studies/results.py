@@ -20,7 +20,7 @@ from ppl_jax.config import values
 
 DONE, DIVERGED, FAILED = "done", "diverged", "failed"
 SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
-COUNTS = ("human_data_usage", "takeovers", "training_cost")
+COUNTS = ("human_data_usage", "human_cost_steps", "takeovers", "training_cost")
 _STATIC = (
     "prediction_horizon",
     "batch_size",

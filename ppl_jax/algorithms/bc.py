@@ -22,15 +22,12 @@ from ppl_jax.losses import Metrics, bc_loss
 from ppl_jax.policies import Novice, make_novice
 from ppl_jax.types import DecisionPoint, EnvSpec, Interaction
 
-RECENCY = "r: the k-th oldest of n rows is drawn with a chance that grows as (k / n)^r."
-
 
 @flax.struct.dataclass
 class ClonerHParams:
     """Traced settings of methods that only clone."""
 
     bc_weight: jax.Array | float = setting(1.0, "Weight of the behaviour-cloning loss.", low=0)
-    recency: jax.Array | float = setting(0.0, RECENCY, low=0)
 
 
 @flax.struct.dataclass
@@ -82,7 +79,7 @@ def update(
     state: ClonerState, key: jax.Array, hparams: HParams, *, policy: Novice, config: TrainConfig
 ) -> tuple[ClonerState, Metrics]:
     """One step of Adam on a batch of the expert's steps."""
-    cloned = buffers.sample(state.human_buffer, key, config.batch_size, hparams.method.recency)
+    cloned = buffers.sample(state.human_buffer, key, config.batch_size, hparams.recency)
     has_data = buffers.size(state.human_buffer) > 0
     loss = functools.partial(cloning_loss, policy=policy, config=config)
     grads, metrics = jax.grad(loss, has_aux=True)(state.learned.params, cloned, hparams)

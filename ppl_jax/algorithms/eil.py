@@ -202,11 +202,13 @@ def store(state: EILState, step: Interaction, hparams: HParams) -> EILState:
     )
 
 
-def sample_batch(state: EILState, key: jax.Array, half: int) -> Batch:
+def sample_batch(
+    state: EILState, key: jax.Array, half: int, recency: jax.Array | float = 0.0
+) -> Batch:
     """`half` steps of either party, and the actions that the expert's are held against."""
     key_human, key_robot, key_others = jax.random.split(key, 3)
-    observation, action, novices = buffers.sample(state.human_buffer, key_human, half)
-    labelled = buffers.sample(state.robot_buffer, key_robot, half)
+    observation, action, novices = buffers.sample(state.human_buffer, key_human, half, recency)
+    labelled = buffers.sample(state.robot_buffer, key_robot, half, recency)
     random = jax.random.uniform(key_others, (OTHERS, *action.shape), minval=-1.0, maxval=1.0)
     return Batch(
         observation=observation,
@@ -258,7 +260,7 @@ def update(
     state: EILState, key: jax.Array, hparams: HParams, *, networks: Networks, config: TrainConfig
 ) -> tuple[EILState, Metrics]:
     """One step of Adam for the values, and every second time for the policy."""
-    batch = sample_batch(state, key, config.batch_size // 2)
+    batch = sample_batch(state, key, config.batch_size // 2, hparams.recency)
     has_human = buffers.size(state.human_buffer) > 0
     actor, critics = state.learned.actor, state.learned.critic
     grads, metrics = jax.grad(critic_loss, has_aux=True)(

@@ -129,7 +129,7 @@ def clone_members(
     """
     count = buffers.size(human.buffer)
     shape = (config.method.members, max(config.batch_size // 2, 1))
-    rows = jax.random.randint(key, shape, 0, jnp.maximum(count, 1))
+    rows = buffers.draw(human.buffer, key, shape, hparams.recency)
     observation, action = jax.tree.map(lambda leaf: leaf[rows], human.buffer.data)  # [K, B, ...]
     weight = jnp.take_along_axis(human.copies.T, rows, axis=1)
     weight = weight / jnp.maximum(jnp.mean(weight, -1, keepdims=True), 1e-9)

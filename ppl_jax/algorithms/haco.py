@@ -195,8 +195,11 @@ def update(
 ) -> tuple[HACOState, Metrics]:
     """One step of Adam for both values, then for the policy and the temperature."""
     key_batch, key_next, key_actor = jax.random.split(key, 3)
-    sample = buffers.sample_both if networks.ported else buffers.sample_split
-    batch, weight = sample(state.replay, key_batch, config.batch_size)
+    replay, count = state.replay, config.batch_size
+    if networks.ported:
+        batch, weight = buffers.sample_both(replay, key_batch, count)
+    else:
+        batch, weight = buffers.sample_split(replay, key_batch, count, hparams.recency)
     has_data = buffers.size(state.replay.human) > 0
     learned, discount = state.learned, hparams.method.discount
     step = functools.partial(adam_step, learning_rate=hparams.learning_rate, do=has_data)

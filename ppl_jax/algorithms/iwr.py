@@ -68,7 +68,7 @@ def update(
     state: IWRState, key: jax.Array, hparams: HParams, *, policy: Novice, config: TrainConfig
 ) -> tuple[IWRState, Metrics]:
     """One step of Adam on a balanced batch."""
-    items, weight = buffers.sample_split(state.steps, key, config.batch_size)
+    items, weight = buffers.sample_split(state.steps, key, config.batch_size, hparams.recency)
     # nothing is learnt before the expert has shown anything
     has_data = buffers.size(state.steps.human) > 0
     loss = functools.partial(weighted_loss, policy=policy, config=config)

@@ -14,7 +14,6 @@ import numpy as np
 
 from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm
-from ppl_jax.algorithms.bc import RECENCY
 from ppl_jax.buffers import RingBuffer
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
@@ -117,7 +116,6 @@ class PPLHParams:
         low=0,
         common=True,
     )
-    recency: jax.Array | float = setting(0.0, RECENCY, low=0)
 
 
 MOST_PAIRS = 10  # that preference_horizon "auto" may choose
@@ -328,7 +326,7 @@ def update(
 ) -> tuple[PPLState, Metrics]:
     """One step of Adam on a batch from either data set."""
     key_human, key_pairs = jax.random.split(key)
-    size, recency = config.batch_size, hparams.method.recency
+    size, recency = config.batch_size, hparams.recency
     cloned = buffers.sample(state.human_buffer, key_human, size, recency)
     pairs = buffers.sample(state.preference_buffer, key_pairs, size, recency)
     has_data = buffers.size(state.human_buffer) > 0

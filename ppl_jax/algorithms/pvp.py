@@ -154,7 +154,9 @@ def update(
 ) -> tuple[PVPState, Metrics]:
     """One step of Adam for the values, and every second time for the policy."""
     key_batch, key_noise = jax.random.split(key)
-    batch, weight = buffers.sample_split(state.replay, key_batch, config.batch_size)
+    batch, weight = buffers.sample_split(
+        state.replay, key_batch, config.batch_size, hparams.recency
+    )
     has_data = buffers.size(state.replay.human) > 0
     actor, critics = state.learned.actor, state.learned.critic
     target = smoothed_target(

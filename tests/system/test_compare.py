@@ -10,7 +10,7 @@ from experiments.engine.run import RunSettings, train
 from experiments.report import paper, tables
 from experiments.report.points import read_points
 from experiments.studies.ablation import LIBRARY, ROWS
-from experiments.studies.tune import points
+from experiments.studies.tune import choose, finalists, points
 from ppl_jax import algorithms, checkpoint
 from tests.helpers import ROOT, Probe, call, outcome, probe_settings, program
 
@@ -142,6 +142,45 @@ def test_all_methods_have_a_grid_of_the_same_size_and_the_paper_s_row():
     assert {len(points(name)) for name in names} == {4}
     assert set(ROWS) == set(paper.ABLATION)
     assert len(ROWS) == 10
+
+
+def test_a_search_keeps_the_published_setting_unless_it_is_clearly_beaten():
+    published, close, best = {"beta": 0.1}, {"beta": 0.2}, {"beta": 0.3}
+    tried = [(published, [0.2, 0.3]), (close, [0.5, 0.7]), (best, [0.7, 0.8])]
+    assert finalists(tried) == [published, best]
+    assert finalists(tried[:1]) == [published]
+    scores = [0.6, 0.7, 0.65, 0.75]  # standard error of the mean 0.032
+    higher = [x + 0.08 for x in scores]  # by 1.8 standard errors of the difference, then by 2.2
+    assert choose([(published, scores), (best, higher)]) == published
+    assert choose([(published, scores), (best, [x + 0.1 for x in scores])]) == best
+    assert choose([(published, scores)]) == published
+
+
+def test_a_search_has_two_rounds_of_fresh_seeds_and_resumes(tmp_path):
+    out = tmp_path / "tune"
+    words = ["tune", "probe", "--algorithms", "hg_dagger", "--seeds", "0", "1"]
+    words += ["--final-seeds", "2", "3", "--total-steps", "200", "--batch-size", "8", "--out", out]
+    program(tmp_path, *words)
+    rows = list(csv.DictReader((out / "tuning.csv").read_text().splitlines()))
+    assert [row["round"] for row in rows] == ["1"] * 4 + ["2"] * 2
+    assert [row["seeds"] for row in rows] == ["2"] * 6
+    assert rows[4]["setting"] == rows[0]["setting"]  # the published one is always in the final
+    assert sorted(row["chosen"] for row in rows[4:]) == ["False", "True"]
+    played = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+    assert len(played) == (4 * 2 + 2 * 2) * 5
+    for row in rows:
+        fields = [part.split(" ") for part in row["setting"].split(", ")]
+        name = ",".join("=".join(field) for field in fields)
+        seeds = ("0", "1") if row["round"] == "1" else ("2", "3")
+        mine = [float(p["success"]) for p in played if name in p["run"] and p["seed"] in seeds
+                and int(p["step"]) >= 120]  # fmt: skip
+        assert float(row["success"]) == pytest.approx(np.mean(mine), abs=1e-4)
+    (out / "tuning.csv").unlink()
+    told = program(tmp_path, *words).stderr
+    assert "12 of them done" in told
+    assert list(csv.DictReader((out / "tuning.csv").read_text().splitlines())) == rows
+    done = program(tmp_path, *words, "--final-seeds", "1", "2", code=2)
+    assert "final_seeds must be fresh, got 1 of seeds again" in done.stderr
 
 
 def test_a_method_is_registered_once_and_with_known_fields():
