@@ -105,7 +105,7 @@ def finalists(tried: Sequence[tuple[Point, Sequence[float]]]) -> list[Point]:
 def choose(played: Sequence[tuple[Point, Sequence[float]]]) -> Point:
     """The published setting, which comes first, unless another beats it by two standard errors.
 
-        mean(b) - mean(a) > 2 sqrt(var(a) / n_a + var(b) / n_b)
+    mean(b) - mean(a) > 2 sqrt(var(a) / n_a + var(b) / n_b)
     """
     (best, scores), *others = played
     for point, found in others:

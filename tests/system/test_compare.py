@@ -1,17 +1,22 @@
 """Host loop and comparisons, on the probe world: phases, resume, failures, tables."""
 
 import csv
+import json
+import shutil
 
+import jax
 import numpy as np
 import pytest
 
 import envs
-from experiments.engine.run import RunSettings, train
+from experiments.engine.run import RunSettings, record_of, train
+from experiments.engine.settings import ADDED
 from experiments.report import paper, tables
 from experiments.report.points import read_points
 from experiments.studies.ablation import LIBRARY, ROWS
 from experiments.studies.tune import choose, finalists, points
 from ppl_jax import algorithms, checkpoint
+from ppl_jax.training import make_train
 from tests.helpers import ROOT, Probe, call, outcome, probe_settings, program
 
 if "probe" not in envs.registered():
@@ -142,6 +147,47 @@ def test_all_methods_have_a_grid_of_the_same_size_and_the_paper_s_row():
     assert {len(points(name)) for name in names} == {4}
     assert set(ROWS) == set(paper.ABLATION)
     assert len(ROWS) == 10
+
+
+BEFORE_SCHEMA_5 = {  # what a learner held, in this order
+    "hparams": ("learning_rate", "expert_noise", "prediction_noise", "method", "gate", "predictor",
+                "world"),
+    "gate": ("min_speed",),
+    "counters": ("steps", "human_data", "takeovers", "episodes", "successes", "cost",
+                 "physics_diverged"),
+    "learner": ("algorithm", "env_state", "takeover", "key", "hparams", "counters", "diverged"),
+}  # fmt: skip
+
+
+def test_a_run_of_before_schema_5_is_continued(tmp_path, capsys):
+    settings = run_settings("haco")
+    train(settings, tmp_path / "now")
+    whole = outcome(tmp_path / "now")
+    out = tmp_path / "old"
+    shutil.copytree(tmp_path / "now", out)
+    (out / "summary.json").unlink()
+    shutil.rmtree(out / "checkpoints" / "step_60")
+    config = json.loads((out / "config.json").read_text())
+    kept = {name: value for name, value in config["settings"].items() if name not in ADDED}
+    kept |= {"physics": "auto", "randomise": False}  # these were there
+    (out / "config.json").write_text(json.dumps(config | {"schema": 4, "settings": kept}))
+    make = algorithms.method("haco").make
+    functions = make_train(Probe(), Probe.scripted_expert, make, settings.config)
+    like = jax.jit(functions.init)(jax.random.key(0), settings.hparams)
+    done, learner = checkpoint.restore(out / "checkpoints", like, print)
+    assert done == 40
+
+    def only(part, what):
+        return record_of({name: getattr(part, name) for name in BEFORE_SCHEMA_5[what]})
+
+    hparams = learner.hparams.replace(gate=only(learner.hparams.gate, "gate"))
+    old = learner.replace(
+        hparams=only(hparams, "hparams"), counters=only(learner.counters, "counters")
+    )
+    checkpoint.save(out / "checkpoints", done, only(old, "learner"))
+    train(RunSettings.from_json(json.loads((out / "config.json").read_text())), out, resume=True)
+    assert "damaged" not in capsys.readouterr().err
+    assert outcome(out) == whole
 
 
 def test_a_search_keeps_the_published_setting_unless_it_is_clearly_beaten():
