@@ -212,6 +212,7 @@ def look_ahead(problem: Problem, learner: Learner, key: jax.Array, action: jax.A
         ahead = jax.custom_batching.sequential_vmap(ahead)
     only = dataclasses.replace(learner, algorithm=None, counters=None)  # what it reads
     trajectory = ahead(only, key_predict, action, params_of(problem, learner.hparams))
+    trajectory = dataclasses.replace(trajectory, clearance=None)  # for gates alone
     if problem.config.noise_at == "gate":
         return trajectory
     noisy = add_noise(key_noise, trajectory.observation, learner.hparams.prediction_noise)
@@ -255,7 +256,6 @@ def no_prediction() -> Trajectory:
         success=no,
         terminated=no,
         valid=no,
-        clearance=empty,
     )
 
 

@@ -144,7 +144,13 @@ def restart(problem: Problem, learner: Learner) -> Learner:
     """See `LiveFunctions`."""
     key, key_reset = jax.random.split(learner.key)
     _, state = problem.env.reset(key_reset, params_of(problem, learner.hparams))
-    return dataclasses.replace(learner, env_state=state, key=key, takeover=jnp.zeros((), bool))
+    return dataclasses.replace(
+        learner,
+        env_state=state,
+        key=key,
+        takeover=jnp.zeros((), bool),
+        costly=jnp.zeros_like(learner.costly),
+    )
 
 
 def ingest_all(
