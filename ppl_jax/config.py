@@ -118,7 +118,7 @@ class TrainConfig:
         low=0,
         group="run",
     )
-    batch_size: int = setting(256, "Samples per loss and update.", low=1, group="run", common=True)
+    batch_size: int = setting(128, "Samples per loss and update.", low=1, group="run", common=True)
     hidden: tuple[int, ...] = setting(
         (256, 256), "Widths of the hidden layers.", low=1, group="run", common=True
     )
@@ -182,8 +182,8 @@ class TrainConfig:
         group="gate",
     )
     likelihood: Literal["gaussian", "laplace"] = setting(
-        "gaussian",
-        "Density behind log pi in the losses.",
+        "laplace",
+        "Density behind log pi in the losses, of a deterministic policy.",
         choices=("gaussian", "laplace"),
         common=True,
     )
@@ -381,13 +381,13 @@ PRESETS = ("default", "paper", "reference")
 def preset_values(preset: str, env: str) -> dict[str, Any]:
     """The flat settings that a preset gives a run in an environment.
 
-    `default`: what works best here: the paper's horizons, beta, gate and pairs; the released code's
-    bias. The paper's loss (bias 1) has no optimum inside the action box for a Gaussian policy and
-    overshoots (`ppl_jax.distributions`).
+    `paper`: the paper to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias 1, its
+    gates. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is
+    that under which its formula has an optimum (`ppl_jax.distributions`).
 
-    `paper`: the paper's formula to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias
-    1. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is that
-    under which its formula has an optimum.
+    `default`: the same, and what was found to help: what `ppl tune` chose for the method
+    (`AlgorithmSpec.tuned`), and in driving a gate that also minds how near a prediction comes to
+    the edge.
 
     `reference`: the released code's settings (metadriverse/PPL at 7a55c24), for driving alone.
 
@@ -407,8 +407,6 @@ def preset_values(preset: str, env: str) -> dict[str, Any]:
     own = about_env.changes(preset)
     if preset == "reference":
         return {**_REFERENCE, **own}
-    if preset == "paper":
-        return {"likelihood": "laplace", "preference_bias": 1.0, **own}
     return own
 
 

@@ -4,17 +4,20 @@ A deterministic policy outputs mu(s) in [-1, 1]^A; the paper does not say which 
 its log pi means, and `beta` means nothing without one. Two are offered; constants that cancel are
 left out. A policy that samples brings its own density (`squashed_log_prob`).
 
-`laplace`: log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.1 unless set. A
-smoothed multivariate Laplace density: quadratic within w of mu (there it is a Gaussian of variance
-b w), linear beyond. The linear tail matters: along the line from a- through a+ it makes
+`laplace`, the default of runs: log pi(a | s) = -(sqrt(|a - mu|^2 + w^2) - w) / b, with b = w = 0.3
+unless set. A smoothed multivariate Laplace density: quadratic within w of mu (there it is a
+Gaussian of variance b w), linear beyond. The linear tail matters twice. It makes cloning a robust
+regression: an expert that jitters pulls no harder the farther off it is. And along the line from
+a- through a+
 
     log pi(a+|s) - log pi(a-|s)
 
-stop growing once mu has reached a+, so the paper's preference loss has its optimum there.
+has little left to gain once mu has reached a+, w / b at most, so that the paper's preference loss
+holds mu near it.
 
-`gaussian` (default): log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate.
-With it that difference is linear in mu: the loss has no optimum inside the action box and pushes
-mu past a+ to a corner, unless the rejected term is scaled down (the released code's 0.5).
+`gaussian`: log pi(a | s) = -|a - mu|^2, variance 1/2, the released code's surrogate. With it that
+difference is linear in mu: the loss has no optimum inside the action box and pushes mu past a+ to a
+corner, unless the rejected term is scaled down (the released code's 0.5).
 
 All are finite with finite gradients everywhere on the action box, its corners included, where the
 expert's clipped actions lie. Another b is the same as `beta` and `bc_weight` divided by it.
@@ -34,8 +37,8 @@ from ppl_jax.checks import check_name
 from ppl_jax.types import Array
 
 LIKELIHOODS = ("gaussian", "laplace")
-LAPLACE_SCALE = 0.1  # b
-LAPLACE_CORE = 0.1  # w
+LAPLACE_SCALE = 0.3  # b
+LAPLACE_CORE = 0.3  # w
 LOG_STD = (-5.0, 2.0)  # range of a learned log standard deviation, before squashing
 EDGE = 1e-3  # a squashed density is that of actions at least so far from the box's edge
 

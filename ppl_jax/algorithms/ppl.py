@@ -111,7 +111,7 @@ class PPLHParams:
         1.0, "Weight of the preference loss; 0 leaves cloning alone.", low=0, common=True
     )
     preference_bias: jax.Array | float = setting(
-        0.5,
+        1.0,
         "Factor on the rejected action's likelihood: 1 in the paper, 0.5 in the released code.",
         low=0,
         common=True,

@@ -191,7 +191,7 @@ def test_ppl_sums_both_losses_by_their_weights():
         observation=means, preferred_action=good, rejected_action=bad, rejected_observation=None
     )
     bc = np.mean(np.sum((means - expert) ** 2, -1))
-    delta = -np.sum((means - good) ** 2, -1) + 0.5 * np.sum((means - bad) ** 2, -1)
+    delta = np.sum((means - bad) ** 2, -1) - np.sum((means - good) ** 2, -1)
     preference = np.mean(np.log1p(np.exp(-0.3 * delta)))
     for has_pairs in (0.0, 1.0):
         loss, _ = ppl.ppl_loss(

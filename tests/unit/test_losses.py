@@ -25,7 +25,7 @@ MEAN, GOOD, BAD, OTHER = (RNG.uniform(-1, 1, (7, 3)).astype(np.float32) for _ in
 def energy(mean, action, kind):
     """Minus the log-likelihood, by a loop."""
     square = sum((float(m) - float(a)) ** 2 for m, a in zip(mean, action, strict=True))
-    return square if kind == "gaussian" else (math.sqrt(square + 0.01) - 0.1) / 0.1
+    return square if kind == "gaussian" else (math.sqrt(square + 0.09) - 0.3) / 0.3
 
 
 def cpo_loss(mean, good, other, bad, beta, bias=1.0, kind="gaussian"):
@@ -128,7 +128,9 @@ def test_gradient_points_from_rejected_to_preferred():
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize(("kind", "overshoots"), [("gaussian", True), ("laplace", False)])
+@pytest.mark.parametrize(
+    ("kind", "overshoots"), [("gaussian", True), (surrogate("laplace", 0.1, 0.1), False)]
+)
 def test_only_the_gaussian_pushes_past_the_preferred_action(kind, overshoots):
     """Minimise the paper's loss on one pair: where does the action end?"""
     good, bad = jnp.array([[0.2, 0.0]]), jnp.array([[-0.2, 0.0]])
@@ -140,6 +142,17 @@ def test_only_the_gaussian_pushes_past_the_preferred_action(kind, overshoots):
     mean = jax.lax.scan(step, jnp.zeros((1, 2)), None, length=400)[0]
     assert (float(mean[0, 0]) > 0.9) is overshoots
     assert float(mean[0, 0]) > 0.15
+
+
+@pytest.mark.parametrize(("scale", "core"), [(0.3, 0.3), (0.1, 0.3), (0.3, 0.05)])
+def test_past_the_preferred_action_the_laplace_has_little_to_gain(scale, core):
+    good, bad = jnp.array([0.2, 0.0]), jnp.array([-0.3, 0.0])
+    mean = jnp.stack([jnp.linspace(0.2, 1.0, 50), jnp.zeros(50)], -1)
+    delta = log_likelihood(mean, good + 0 * mean, "laplace", scale=scale, core=core)
+    delta -= log_likelihood(mean, bad + 0 * mean, "laplace", scale=scale, core=core)
+    gained = np.asarray(delta - delta[0])
+    assert np.all(np.diff(gained) > -1e-4)
+    assert gained[-1] <= core / scale
 
 
 @KINDS
