@@ -41,7 +41,8 @@ class Localised(NamedTuple):
     Attributes:
         long, lateral: The ego's coordinates on every lane, [M], m.
         on_lane: Whether it is on any lane of the map.
-        left, right: Distance to the edges of the reference road, m.
+        left, right: Distance to the edges of the reference road, m; its width is that of a lane
+            times their number, as in MetaDrive, where a ramp's last lane tapers too.
     """
 
     long: jax.Array
