@@ -134,6 +134,7 @@ def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """A config.json of an older version with what its run does, in today's words.
 
     Before schema 3 no buffer was longer than the run. Before schema 4 there were no pairs at s_t.
+    Before schema 5 the Laplace likelihood was narrower.
     """
     schema, held = schema_of(content), "settings" if "settings" in content else "config"
     settings = dict(content.get(held, {}))
@@ -141,6 +142,8 @@ def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
         settings["human_capacity"] = min(settings["human_capacity"], settings["total_steps"])
     if schema < 4 and settings.get("pair_states") == "predicted":
         settings["pair_states"] = "future"
+    if schema < 5 and "likelihood" in settings:
+        settings = {"laplace_scale": 0.1, "laplace_core": 0.1} | settings
     return {**content, held: settings} if held in content else content
 
 

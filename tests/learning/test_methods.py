@@ -10,6 +10,7 @@ import pytest
 
 from ppl_jax import algorithms, checkpoint
 from ppl_jax.config import as_arrays
+from ppl_jax.experts import SavedPolicy
 from ppl_jax.training import make_train
 from tests.helpers import OWN, Balance, Goal, Probe, pairwise, programs, success
 
@@ -36,6 +37,26 @@ def test_a_probe_world_is_solved(name):
     world, count = PROBES.get(name, Probe), SEEDS.get(name, 2)
     solved = [success(world, both.functions, lane(learners, i)) == 1.0 for i in range(count)]
     assert sum(solved) >= (count // 2 if name in SEEDS else count)
+
+
+@pytest.mark.parametrize("name", ["ppl", "hg_dagger"])
+def test_a_novice_that_samples_solves_the_probe_world_by_its_mean(name):
+    alone = programs(name, Probe, policy="gaussian")
+    learner = alone.play(jax.random.key(0))
+    assert success(Probe, alone.functions, learner) == 1.0
+    state, algorithm = learner.algorithm, alone.functions.algorithm
+    observation = jnp.array([1.0, 0.0, 1.0])
+    keys = jax.random.split(jax.random.key(1), 4000)
+    drawn = jax.vmap(lambda key: algorithm.act(state, key, observation))(keys)
+    assert float(drawn.std()) > 1e-3
+    layers = algorithm.policy(state)
+    assert layers[-1][0].shape[-1] == layers[-1][1].shape[-1] == 1  # the mean's, not the spread's
+    averaged = dataclasses.replace(state.learned, params=state.learned.average)
+    state = dataclasses.replace(state, learned=averaged)
+    drawn = jax.vmap(lambda key: algorithm.act(state, key, observation))(keys)
+    spec = Probe().spec
+    policy = SavedPolicy(layers, "relu", "tanh", spec.observation_mean, spec.observation_scale)
+    np.testing.assert_allclose(np.median(drawn), policy(observation)[0], atol=0.02)
 
 
 @pytest.mark.parametrize("name", NAMES)

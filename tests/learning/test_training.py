@@ -375,6 +375,10 @@ def test_a_diverged_run_is_flagged_and_frozen():
         ("ppl", {"prediction_noise": -1.0}, "prediction_noise must not be negative"),
         ("ppl", {"hidden": ()}, "hidden must name at least one width"),
         ("ppl", {"hidden": (8, 0)}, "hidden must be at least 1, got"),
+        ("ppl", {"policy": "gaussian", "objective": "dpo"}, "policy must be deterministic with"),
+        ("ppl", {"policy": "beta"}, "policy must be one of deterministic, gaussian, got 'beta'"),
+        ("ppl", {"laplace_core": 0.0}, "laplace_core must be at least 0.001, got 0"),
+        ("ppl", {"recency": -1.0}, "recency must not be negative, got -1"),
         ("ppl", {"likelihood": "student"}, "likelihood must be one of gaussian, laplace, got"),
     ],
 )
