@@ -54,9 +54,10 @@ _SQUARED_ERROR = {"likelihood": "gaussian"}  # what these methods published
 _VALUES_ALONE = {"bc_weight": 0.0}  # no cloning term in the published losses
 
 # `tuned` is what searches on training and tuning scenarios of driving found, and is used in every
-# environment: recency and learning rate of ppl and hg_dagger in experiments/results/
-# driving_choices.csv, the rest by a smaller search of one seed and 3,000 steps before that
-# (driving_tuning.csv). `grid` holds the values that `ppl tune` tries, the published one first.
+# environment: for ppl single changes with ten seeds (experiments/results/driving_choices.csv), for
+# hg_dagger `ppl tune` (driving_tuning_two_rounds.csv), for the rest a smaller search of one seed
+# and 3,000 steps before that (driving_tuning.csv). `grid` holds the values that `ppl tune` tries,
+# the published one first.
 _GRID = {"learning_rate": (3e-4, 1e-3), "recency": (0.0, 3.0)}
 _SLOWER = {"learning_rate": (1e-4, 3e-4), "recency": (0.0, 3.0)}
 
@@ -93,7 +94,6 @@ register(
 register(
     "hg_dagger",
     make_hg_dagger,
-    tuned={"recency": 3.0},
     config=ClonerConfig,
     hparams=ClonerHParams,
     grid=_GRID,
