@@ -382,12 +382,11 @@ def preset_values(preset: str, env: str) -> dict[str, Any]:
     """The flat settings that a preset gives a run in an environment.
 
     `paper`: the paper to the letter: H = 10, L = 4 (6 in nut assembly), beta = 0.1, bias 1, its
-    gates. It leaves network, batch, learning rate and likelihood open; the Laplace likelihood is
-    that under which its formula has an optimum (`ppl_jax.distributions`).
+    gates. It leaves network, batch, learning rate and likelihood open; under the Laplace
+    likelihood its formula holds the policy near the preferred action (`ppl_jax.distributions`).
 
-    `default`: the same, and what was found to help: what `ppl tune` chose for the method
-    (`AlgorithmSpec.tuned`), and in driving a gate that also minds how near a prediction comes to
-    the edge.
+    `default`: the same, and what was found to help: the method's own (`AlgorithmSpec.tuned`), and
+    in driving a gate that also minds how near a prediction comes to the edge.
 
     `reference`: the released code's settings (metadriverse/PPL at 7a55c24), for driving alone.
 

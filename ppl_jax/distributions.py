@@ -144,16 +144,20 @@ def squashed_log_prob(output: Array, action: Array) -> jax.Array:
     """
     mean, log_std = mean_and_log_std(output)
     chex.assert_equal_shape([mean, action], custom_message="mean and action")
-    inside = jnp.clip(action, EDGE - 1.0, 1.0 - EDGE)
+    inside = _inside(action)
     squashing = jnp.sum(jnp.log1p(-(inside**2)), -1)
     return gaussian_log_prob(mean, log_std, jnp.arctanh(inside)) - squashing
+
+
+def _inside(action: Array) -> jax.Array:
+    """The nearest action at least `EDGE` from the box's edge, where atanh is finite."""
+    return jnp.clip(action, EDGE - 1.0, 1.0 - EDGE)
 
 
 def _squashed_attaining(output: Array, action: Array) -> jax.Array:
     """`Likelihood.attaining`: tanh of the mean is the action, the spread stays."""
     spread = jnp.split(jnp.asarray(output), 2, -1)[1]
-    inside = jnp.clip(action, EDGE - 1.0, 1.0 - EDGE)
-    return jnp.concatenate([jnp.arctanh(inside), spread], -1)
+    return jnp.concatenate([jnp.arctanh(_inside(action)), spread], -1)
 
 
 SQUASHED = Likelihood(log_prob=squashed_log_prob, attaining=_squashed_attaining)

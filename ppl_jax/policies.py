@@ -11,10 +11,15 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from ppl_jax.config import HParams, TrainConfig
-from ppl_jax.distributions import SQUASHED, Likelihood, mean_and_log_std, surrogate
+from ppl_jax.distributions import (
+    SQUASHED,
+    Likelihood,
+    mean_and_log_std,
+    squashed_gaussian,
+    surrogate,
+)
 from ppl_jax.fields import setting
 from ppl_jax.networks import Layers, Params, layers, make_policy, make_raw
 from ppl_jax.types import EnvSpec
@@ -85,7 +90,7 @@ def _gaussian(spec: EnvSpec, config: TrainConfig) -> Novice:
 
     def act(params: Params, key: jax.Array, observation: jax.Array) -> jax.Array:
         mean, log_std = mean_and_log_std(network.apply(params, observation))
-        return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
+        return squashed_gaussian(key, mean, log_std)[0]
 
     def layers_of_mean(params: Params) -> Layers:
         *inner, (w, b) = layers(params)

@@ -143,7 +143,7 @@ def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
     if schema < 4 and settings.get("pair_states") == "predicted":
         settings["pair_states"] = "future"
     if schema < 5 and "likelihood" in settings:
-        settings = {"laplace_scale": 0.1, "laplace_core": 0.1} | settings
+        settings = {name: ADDED[name] for name in ("laplace_scale", "laplace_core")} | settings
     return {**content, held: settings} if held in content else content
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, check, run_settings
 from experiments.studies.grid import Run, run_name
-from experiments.studies.runner import Execution, execute
+from experiments.studies.runner import COMMON, Execution, execute
 from ppl_jax import algorithms
 from ppl_jax.cards import card
 from ppl_jax.config import values
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _OF_EVERY_METHOD = ("batch_size", "physics")
 OPTIONS = ("gate", "min_return", "max_departure", "min_log_density", *_OF_EVERY_METHOD)
-COMMON = ("preset", "expert", "scenarios", "held_out_scenarios", "evaluate_on")
 
 
 def compare(command: Compare) -> None:

@@ -14,13 +14,12 @@ from experiments.engine.files import write_text_atomic
 from experiments.engine.plan import evaluation_steps
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import ADDED, traced_values
+from experiments.report.points import COUNTS, SCORES
 from experiments.report.tables import EPISODES, RESULTS
 from experiments.studies.grid import Run, plain, show
 from ppl_jax.config import values
 
 DONE, DIVERGED, FAILED = "done", "diverged", "failed"
-SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
-COUNTS = ("human_data_usage", "human_cost_steps", "takeovers", "training_cost")
 _STATIC = (
     "prediction_horizon",
     "batch_size",

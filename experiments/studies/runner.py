@@ -146,7 +146,7 @@ def _settings(
     given = chosen | _worlds(command)
     if command.total_steps is not None:
         given["total_steps"] = command.total_steps
-    common = {name: getattr(command, name) for name in _COMMON}
+    common = {name: getattr(command, name) for name in COMMON}
     settings = run_settings(env, algorithm, seed, **common, given=given)
     config = settings.config
     study = _study(command)
@@ -167,7 +167,7 @@ def _settings(
     return settings
 
 
-_COMMON = ("preset", "expert", "scenarios", "held_out_scenarios", "evaluate_on")
+COMMON = ("preset", "expert", "scenarios", "held_out_scenarios", "evaluate_on")
 
 
 @dataclasses.dataclass(frozen=True)
