@@ -120,14 +120,15 @@ def _save_policy(
 
 
 def _rows(looks: list[Look], numbers: Any) -> Reply:
-    """One run's rows: one per evaluation, and one per scenario of the last evaluation."""
+    """One run's rows: one per evaluation, and one per evaluation and scenario."""
     from experiments.engine.evaluate import rows_of
 
-    rows, last = [], []
+    rows, episodes = [], []
     for look in looks:
         counters = {name: getattr(look.counters, name).item() for name in _COUNTED}
-        last = rows_of(look.episodes, numbers, look.step)
-        means = {name: f"{np.mean([getattr(row, name) for row in last]):.6g}" for name in _SCORES}
+        played = rows_of(look.episodes, numbers, look.step)
+        means = {name: f"{np.mean([getattr(row, name) for row in played]):.6g}" for name in _SCORES}
+        episodes += [row._asdict() for row in played]
         row = {
             "step": look.step,
             "status": "diverged" if look.diverged else "done",
@@ -137,7 +138,7 @@ def _rows(looks: list[Look], numbers: Any) -> Reply:
             "training_cost": f"{counters['cost']:g}",
         }
         rows.append(row | means)
-    return {"rows": rows, "episodes": [row._asdict() for row in last]}
+    return {"rows": rows, "episodes": episodes}
 
 
 _COUNTED = ("human_data", "human_cost_steps", "takeovers", "cost")

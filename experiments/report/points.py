@@ -263,7 +263,7 @@ def read_points(path: Path) -> list[Point]:
     Args:
         path: A run folder; a folder of ppl sweep, compare, ablation or tune; or a file of theirs,
             with a row per run and evaluation or per scenario. Beside RESULTS.csv a row per scenario
-            is looked for in episodes.csv or RESULTS_episodes.csv.
+            is looked for in episodes.csv or RESULTS_episodes.csv (either may be a .csv.gz).
 
     Raises:
         UserError: If there are no results.
@@ -328,12 +328,10 @@ def _point(
 def _episodes(path: Path) -> Frame | None:
     """The rows per scenario that belong to a results file, if they are there."""
     results = results_path(path)
-    names = [results.with_name(f"{results.stem}_episodes.csv")]
-    if results.name == RESULTS:
-        names.append(results.with_name(EPISODES))
-    for name in names:
-        if name.is_file():
-            return read_frame(name)
+    names = [f"{results.stem}_{EPISODES}", *([EPISODES] if results.name == RESULTS else [])]
+    for name in (name + ending for name in names for ending in ("", ".gz")):
+        if (results.parent / name).is_file():
+            return read_frame(results.parent / name)
     return None
 
 

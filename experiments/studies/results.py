@@ -32,7 +32,7 @@ _STATIC = (
 
 
 class Results:
-    """results.csv (a row per run and evaluation) and episodes.csv (a row per held-out scenario).
+    """results.csv (a row per run and evaluation) and episodes.csv (a row per scenario of each).
 
     Args:
         out: Folder of both.
@@ -87,7 +87,7 @@ class Results:
             mine, played = rows.get(run.name, []), episodes.get(run.name, [])
             steps = evaluation_steps(run.settings.config, run.settings.evaluate_every)
             if [row.get("step") for row in mine] == [str(step) for step in steps] and played:
-                whole = {int(row["scenario"]) for row in played}
+                whole = {(row["step"], row["scenario"]) for row in played}
                 if len(whole) == len(played):
                     self.rows[run.name], self.episodes[run.name] = mine, played
         if rows or episodes:
@@ -101,8 +101,9 @@ class Results:
 
     def add(self, run: Run, reply: dict[str, Any]) -> None:
         """A run that came back: its rows go to the files at once."""
+        human = {row["step"]: row["human_data_usage"] for row in reply["rows"]}
         self.episodes[run.name] = [
-            self._episode(run, reply["rows"][-1], row) for row in reply["episodes"]
+            self._episode(run, human[row["step"]], row) for row in reply["episodes"]
         ]
         self.rows[run.name] = [self._row(run, row) for row in reply["rows"]]
         _append(self.out / EPISODES, self.episode_columns, self.episodes[run.name])
@@ -130,9 +131,9 @@ class Results:
         whole = self._where(run) | static | hparams | dict(run.values) | row
         return {name: plain(whole.get(name, "")) for name in self.columns}
 
-    def _episode(self, run: Run, last: dict[str, Any], row: dict[str, Any]) -> dict[str, str]:
+    def _episode(self, run: Run, human_data: int, row: dict[str, Any]) -> dict[str, str]:
         whole = self._where(run) | dict(run.values) | row
-        whole |= {"human_data_usage": last["human_data_usage"]}
+        whole |= {"human_data_usage": human_data}
         return {name: plain(whole.get(name, "")) for name in self.episode_columns}
 
     def note(self, run: Run) -> str:

@@ -1,6 +1,7 @@
 """Tables and figures, from result files alone."""
 
 import csv
+import gzip
 import json
 import re
 import shutil
@@ -220,6 +221,11 @@ def test_table_compare_and_notebook_give_the_same_interval(tmp_path, capsys):
     assert "over 3 seeds and 20 held-out scenarios" in told
     tables.print_comparison(tmp_path / "episodes.csv")
     assert f"pvp     {shown}" in capsys.readouterr().out
+    (tmp_path / "episodes.csv.gz").write_bytes(
+        gzip.compress((tmp_path / "episodes.csv").read_bytes())
+    )
+    (tmp_path / "episodes.csv").unlink()
+    assert report.difference(*reversed(report.read_points(tmp_path))) == report.difference(pvp, ppl)
 
 
 @pytest.mark.parametrize(
