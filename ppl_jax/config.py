@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax.cards import card
-from ppl_jax.checks import did_you_mean
+from ppl_jax.checks import check_number, did_you_mean
 from ppl_jax.distributions import LAPLACE_CORE, LAPLACE_SCALE
 from ppl_jax.fields import About, about, setting
 
@@ -495,8 +495,7 @@ def check_value(name: str, value: Any, about: About) -> None:
         raise ValueError(f"{name} must {allowed}, got {shown}")
     if high is not None and not (numbers <= high).all():
         raise ValueError(f"{name} must be at most {high:g}, got {shown}")
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{name} must be a finite number, got {shown}")
+    check_number(name, value)
 
 
 def as_arrays(hparams: HParams) -> HParams:

@@ -15,9 +15,11 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from ppl_jax.algorithms.base import Algorithm
-from ppl_jax.config import HParams, TrainConfig, as_arrays, env_params
+from ppl_jax.config import HParams, TrainConfig, as_arrays, env_params, validate
+from ppl_jax.learned import all_finite
 from ppl_jax.losses import Metrics
 from ppl_jax.predictors import add_noise, predict, predictor
 from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory
@@ -63,7 +65,8 @@ class Learner:
         key: Random key.
         hparams: The run's hyper-parameters.
         counters: `Counters`.
-        diverged: A loss was not finite: what was learned stays as it was before.
+        diverged: A loss, a parameter or a moment of the optimiser was not finite: what was learned
+            stays as it was before.
     """
 
     algorithm: PyTree
@@ -133,7 +136,13 @@ def params_of(problem: Problem, hparams: HParams) -> PyTree:
 
 
 def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
-    """A learner before its first step."""
+    """A learner before its first step.
+
+    Raises:
+        ValueError: If a setting is out of its range; traced ones cannot be checked.
+    """
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(hparams)):
+        validate(problem.config, hparams)
     key, key_algorithm, key_env = jax.random.split(key, 3)
     _, env_state = problem.env.reset(key_env, params_of(problem, hparams))
     zero = jnp.zeros((), jnp.int32)
@@ -348,7 +357,7 @@ def ingest(problem: Problem, learner: Learner, step: Interaction) -> Learner:
 
 
 def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
-    """One update; where a loss is not finite, what was learned stays as it was.
+    """One update; where a loss or what it leads to is not finite, what was learned stays as it was.
 
     Args:
         learner: Before the update.
@@ -357,8 +366,7 @@ def learn(learner: Learner, update: Callable) -> tuple[Learner, Metrics]:
     key, key_update = jax.random.split(learner.key)
     before = learner.algorithm
     updated, metrics = update(before, key_update, learner.hparams)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(metrics)]))
-    diverged = learner.diverged | ~finite
+    diverged = learner.diverged | ~all_finite((metrics, updated.learned))
     kept = jax.tree.map(
         lambda new, old: jnp.where(diverged, old, new), updated.learned, before.learned
     )

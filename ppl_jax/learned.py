@@ -44,6 +44,11 @@ def init_learned(params: PyTree) -> Learned:
     )
 
 
+def all_finite(tree: PyTree) -> jax.Array:
+    """Whether every number of a tree is finite: parameters and Adam's moments as well as losses."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
 def adam_step(
     learned: Learned,
     grads: PyTree,

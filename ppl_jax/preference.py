@@ -13,6 +13,7 @@ from __future__ import annotations
 import chex
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from ppl_jax.checks import check_name
 from ppl_jax.types import Interaction, PreferenceBatch
@@ -27,7 +28,7 @@ def preference_pairs(
 
     Args:
         step: With `predicted` of M >= L steps.
-        preference_horizon: L, traced.
+        preference_horizon: L; a traced one beyond M counts as M.
         pair_states: "predicted" (the paper: s_t and s~_{t+1} .. s~_{t+L}), "future" (the same
             without s_t), or "shifted" (the released code: the preferred action at state k, the
             rejected one at state k + 1, for k = 0..L-1).
@@ -36,7 +37,7 @@ def preference_pairs(
         Pairs and their mask; M of them, with s_t M + 1.
 
     Raises:
-        ValueError: If `pair_states` is unknown.
+        ValueError: If `pair_states` is unknown, or L, where it is not traced, exceeds M.
         AssertionError: If shapes do not fit.
     """
     check_name("pair_states", pair_states, PAIR_STATES)
@@ -46,6 +47,11 @@ def preference_pairs(
     chex.assert_equal_shape(
         [step.expert_action, step.novice_action], custom_message="expert_action and novice_action"
     )
+    if not isinstance(preference_horizon, Tracer) and preference_horizon > count:
+        raise ValueError(
+            f"preference_horizon must not exceed the predicted states ({count}), got "
+            f"{preference_horizon}"
+        )
     mask = step.takeover & predicted.valid & (jnp.arange(count) < preference_horizon)
     observation, rejected = predicted.observation, None
     if pair_states != "future":

@@ -91,7 +91,11 @@ class PPLConfig(ClonerConfig):
 
 @flax.struct.dataclass
 class PPLHParams:
-    """Traced settings of PPL."""
+    """Traced settings of PPL.
+
+    An L beyond `PPLConfig.max_preference_horizon` is refused; within `jax.jit` or `jax.vmap`, where
+    its value is not known, it counts as that, and the metric `train/horizon_cut` is 1.
+    """
 
     preference_horizon: jax.Array | float = setting(
         4,
@@ -324,7 +328,11 @@ def update(
     config: TrainConfig,
     reference: Reference | None = None,
 ) -> tuple[PPLState, Metrics]:
-    """One step of Adam on a batch from either data set."""
+    """One step of Adam on a batch from either data set.
+
+    The metric `horizon_cut` is 1 where L exceeds `max_preference_horizon`: a traced L cannot be
+    refused, and no more pairs than that are kept.
+    """
     key_human, key_pairs = jax.random.split(key)
     size, recency = config.batch_size, hparams.recency
     cloned = buffers.sample(state.human_buffer, key_human, size, recency)
@@ -338,6 +346,8 @@ def update(
         state.learned.params, cloned, pairs, has_pairs.astype(jnp.float32)
     )
     learned = adam_step(state.learned, grads, hparams.learning_rate, has_data)
+    asked, most = hparams.method.preference_horizon, config.method.max_preference_horizon
+    metrics = metrics | {"horizon_cut": jnp.asarray(asked > most, jnp.float32)}
     if state.horizon is not None:
         metrics = metrics | {"preference_horizon": pairs_per_step(state, hparams)}
     return dataclasses.replace(state, learned=learned), metrics

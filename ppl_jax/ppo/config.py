@@ -14,7 +14,7 @@ import flax.struct
 import jax
 import numpy as np
 
-from ppl_jax.checks import did_you_mean
+from ppl_jax.checks import check_number, did_you_mean
 from ppl_jax.config import Setting, settings_of
 from ppl_jax.fields import About, about, setting
 
@@ -250,8 +250,9 @@ def _check_range(name: str, value: Any, field: About) -> None:
         return
     if field.low is None:
         return
+    check_number(name, value)
     high = math.inf if field.high is None else field.high
-    if not math.isfinite(value) or not field.low <= value <= high:
+    if not field.low <= value <= high:
         raise ValueError(f"{name} must {allowed(field, isinstance(value, int))}, got {value}")
 
 

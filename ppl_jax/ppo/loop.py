@@ -40,7 +40,7 @@ import jax.numpy as jnp
 
 from ppl_jax.distributions import gaussian_log_prob, log_likelihood
 from ppl_jax.experts import SavedPolicy
-from ppl_jax.learned import Learned, adam_step, init_learned
+from ppl_jax.learned import Learned, adam_step, all_finite, init_learned
 from ppl_jax.losses import Metrics
 from ppl_jax.networks import layers
 from ppl_jax.ppo.cloning import clone
@@ -353,8 +353,7 @@ def iterate(problem: Problem, learner: PPOLearner, _: None) -> tuple[PPOLearner,
     seen = jnp.reshape(steps.observation, (problem.config.batch_steps, -1))
     learned = dataclasses.replace(learned, inputs=learned.inputs.add(seen))
     metrics |= more
-    finite = jnp.all(jnp.isfinite(jnp.stack(list(metrics.values()))))
-    diverged = learner.diverged | ~finite
+    diverged = learner.diverged | ~all_finite((metrics, learned))
     kept = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), learned, before)
     metrics |= {
         "episodes": jnp.sum(steps.done),

@@ -112,7 +112,8 @@ class PPOLearner:
         key: Random key.
         hparams: `PPOHParams`.
         batches: Batches so far.
-        diverged: A loss was not finite: what was learned stays as it was before.
+        diverged: A loss, a parameter or a moment of the optimiser was not finite: what was learned
+            stays as it was before.
     """
 
     learned: PPOLearned
