@@ -341,12 +341,12 @@ class Figure:
 @hide_unset
 @dataclasses.dataclass
 class Export:
-    """Write a run's policy as one file that plain NumPy can run."""
+    """Write a run's policy as one file: .npz, which plain NumPy can run, or .onnx."""
 
     run: Positional[Path]
     """Run folder."""
     out: Path = Path("policy.npz")
-    """File to write."""
+    """File to write; its ending says which kind."""
 
 
 @hide_unset

@@ -68,6 +68,7 @@ PIECES = (
         modules=("starlette", "uvicorn", "websockets", "PIL"),
     ),
     Piece(name="minari", what="sessions as Minari data sets", modules=("minari", "h5py")),
+    Piece(name="onnx", what="policies as .onnx", modules=("onnx",)),
     Piece(name="warp", what="MuJoCo Warp on CUDA devices", modules=("warp",)),
     Piece(name="docs", what="building the documentation", modules=("mkdocs", "mkdocstrings")),
     Piece(

@@ -68,7 +68,7 @@ def test_doctor_lists_every_extra_and_how_to_install_it(monkeypatch, capsys):
     lines = capsys.readouterr().out.partition("\nExtras\n")[2].splitlines()
     found = {line.split()[0]: line for line in lines}
     assert list(found) == [
-        *("render", "plot", "brax", "ray", "ui", "minari", "warp", "docs", "dev"),
+        *("render", "plot", "brax", "ray", "ui", "minari", "onnx", "warp", "docs", "dev"),
         "chromium",
     ]
     for name, line in found.items():
