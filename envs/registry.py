@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from envs.driving.card import DRIVING
 from envs.manipulation.cards import LIFT, NUT_ASSEMBLY, TABLE_WIPING
 from ppl_jax.cards import DEFAULT, EnvCard, card, register_card
+from ppl_jax.plugins import note_caller
 
 if TYPE_CHECKING:
     from ppl_jax.types import Env
@@ -41,6 +42,7 @@ def register(
     if not callable(maker):
         raise ValueError(f"environment {name!r}: the maker must be callable, got {maker!r}")
     _MAKERS[name] = maker
+    note_caller()
     register_card(name, card)
     if checked:
         _CHECKED.add(name)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ppl_jax.config import HParams, NoHParams, check_unique, did_you_mean
 from ppl_jax.fields import setting
+from ppl_jax.plugins import note_caller
 from ppl_jax.types import DecisionPoint
 
 Scale = np.ndarray | jax.Array
@@ -189,6 +190,7 @@ def register_gate(
     if name in _GATES:
         raise ValueError(f"gate {name!r} is registered already")
     check_unique(hparams)
+    note_caller()
     _GATES[name] = Gate(
         decide=decide,
         hparams=hparams,

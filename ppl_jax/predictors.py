@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from ppl_jax.config import NoHParams, check_unique, did_you_mean
+from ppl_jax.plugins import note_caller
 from ppl_jax.types import Env, Expert, Outcome, Trajectory, Transition
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]
@@ -191,6 +192,7 @@ def register_predictor(
     if name in _PREDICTORS:
         raise ValueError(f"predictor {name!r} is registered already")
     check_unique(hparams)
+    note_caller()
     _PREDICTORS[name] = Predictor(make, hparams)
 
 

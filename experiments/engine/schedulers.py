@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
 import subprocess
-import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.preparation import Preparation, preparation, prepare, words
 from experiments.engine.runtime import UserError, need
-from experiments.engine.worker import Job, Reply
+from experiments.engine.worker import ALIVE, READY, Job, Reply
 
-SERVE = "sweep-worker"  # the hidden command that a worker process is started with
 TRIES = 2  # of a job whose worker dies
+SILENCE_S = 60.0  # after which a worker that says nothing has failed
 
 
 def cores(processes: int) -> list[int | None]:
@@ -45,7 +47,7 @@ def local(jobs: Sequence[Job], processes: int, log: Path) -> Iterator[tuple[int,
     for number in range(len(jobs)):
         waiting.put(number)
     done: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
-    workers = [_Process(core, log) for core in cores(processes)[: len(jobs)]]
+    workers = [_Process(core, log, preparation()) for core in cores(processes)[: len(jobs)]]
 
     def work(worker: _Process) -> None:
         while True:
@@ -71,43 +73,91 @@ def local(jobs: Sequence[Job], processes: int, log: Path) -> Iterator[tuple[int,
 class _Process:
     """A worker process, started when it gets its first job and again where it died."""
 
-    def __init__(self, core: int | None, log: Path):
-        self.core, self.log = core, log
+    def __init__(self, core: int | None, log: Path, known: Preparation):
+        self.core, self.log, self.known = core, log, known
         self.process: subprocess.Popen[str] | None = None
+        self.lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.failed: Reply | None = None  # to start: no job has a chance
 
     def run(self, job: Job) -> Reply:
-        code = None
+        if self.failed is not None:
+            return self.failed
+        reply: Reply = {}
         for _ in range(TRIES):
-            process = self.process or self._start()
-            try:
-                assert process.stdin is not None
-                assert process.stdout is not None
-                process.stdin.write(json.dumps(job) + "\n")
-                process.stdin.flush()
-                answer = process.stdout.readline()
-            except OSError:
-                answer = ""
-            if answer:
-                return json.loads(answer)
-            code = process.wait()
-            self.process = None
-        return {"error": f"its worker died (exit status {code}); see {self.log}"}
+            if self.process is None and (started := self._start()) != READY:
+                self.failed = started
+                return started
+            reply = self._ask(job)
+            if not reply.get("lost"):
+                return reply
+        return reply
 
-    def _start(self) -> subprocess.Popen[str]:
-        # the program that was called: it may have registered methods or environments of its own
-        words = [sys.executable, sys.argv[0], SERVE]
+    def _start(self) -> Reply:
+        """A new process that is prepared, or what went wrong."""
         with open(self.log, "a") as log:
             self.process = subprocess.Popen(
-                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
+                words(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
             )
         if self.core is not None:
             os.sched_setaffinity(self.process.pid, {self.core})
-        return self.process
+        self.lines = queue.SimpleQueue()
+        reader = threading.Thread(target=_read, args=(self.process, self.lines), daemon=True)
+        reader.start()
+        return self._ask(self.known, patient=False)
+
+    def _ask(self, message: dict[str, Any], patient: bool = True) -> Reply:
+        """What the process answers; it is stopped where it does not.
+
+        Args:
+            message: A job, or the preparation.
+            patient: Signs of life count as well: a job may take hours.
+        """
+        process = self.process
+        assert process is not None
+        assert process.stdin is not None
+        try:
+            process.stdin.write(json.dumps(message) + "\n")
+            process.stdin.flush()
+            end = time.monotonic() + SILENCE_S
+            while line := self.lines.get(timeout=max(end - time.monotonic(), 0.0)):
+                if (reply := json.loads(line)) != ALIVE:
+                    return reply
+                if patient:
+                    end = time.monotonic() + SILENCE_S
+        except queue.Empty:
+            self.stop()
+            return self._lost(f"did not answer for {SILENCE_S:.0f} s")
+        except OSError:
+            pass  # it has gone
+        return self._lost(f"died (exit status {self._end()})")
+
+    def _lost(self, what: str) -> Reply:
+        text = self.log.read_text(errors="replace").strip()
+        said = f", which ends with: {text.splitlines()[-1]}" if text else ", which is empty"
+        return {"error": f"its worker {what}; see {self.log}{said}", "lost": True}
 
     def stop(self) -> None:
         if self.process is not None:
             self.process.kill()
-            self.process.wait()
+            self._end()
+
+    def _end(self) -> int:
+        """Wait for the end of the process; returns its exit status."""
+        process, self.process = self.process, None
+        assert process is not None
+        assert process.stdin is not None
+        with contextlib.suppress(OSError):  # what it did not read is lost with it
+            process.stdin.close()
+        return process.wait()
+
+
+def _read(process: subprocess.Popen[str], lines: queue.SimpleQueue[str]) -> None:
+    """Hand over what a process says, a line each, and an empty one when it has gone."""
+    assert process.stdout is not None
+    with process.stdout:
+        for line in process.stdout:
+            lines.put(line)
+    lines.put("")
 
 
 def here(jobs: Sequence[Job]) -> Iterator[tuple[int, Reply]]:
@@ -140,7 +190,9 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
         raise UserError(f"address: no Ray cluster at {address!r}: {error}") from error
     task = ray.remote(num_cpus=1, max_retries=-1)(_task)
     try:
-        numbers = {task.remote(job, sys.argv[0]): number for number, job in enumerate(jobs)}
+        known = preparation()
+        del known["process"]["sys_path"]  # another machine has its own
+        numbers = {task.remote(job, known): number for number, job in enumerate(jobs)}
         left = list(numbers)
         while left:
             ready, left = ray.wait(left, num_returns=1)
@@ -153,24 +205,16 @@ def ray_cluster(jobs: Sequence[Job], address: str | None) -> Iterator[tuple[int,
         ray.shutdown()
 
 
-def _task(job: Job, program: str) -> Reply:
-    """A job in a Ray worker, which keeps its programs and its core for the next one.
-
-    The program that was called is run first, without its main part, where it is a script: it may
-    register methods or environments of its own.
-    """
+def _task(job: Job, known: Preparation) -> Reply:
+    """A job in a Ray worker, which keeps its programs and its core for the next one."""
     global _worker
-    import runpy
-
     from experiments.engine.runtime import start_jax
     from experiments.engine.worker import Worker
 
     if _worker is None:
         _claim_core()
         start_jax()
-        if program.endswith(".py"):
-            runpy.run_path(program, run_name="worker")
-        _worker = Worker()
+        _worker = Worker(prepare(known))
     return _worker.run(job)
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from experiments.engine.preparation import prepare
+from ppl_jax.plugins import VARIABLE
 
 if TYPE_CHECKING:
     from experiments.engine.plan import Chunk
@@ -20,6 +24,9 @@ if TYPE_CHECKING:
 
 Job = dict[str, Any]
 Reply = dict[str, Any]
+BEAT_S = 2.0
+ALIVE: Reply = {"alive": True}
+READY: Reply = {"ready": True}
 
 
 class Worker:
@@ -27,9 +34,13 @@ class Worker:
 
     A job is `{"settings": ..., "runs": [{"index", "seed", "hparams"}, ...], "side_by_side"}`; the
     reply `{"compile_s", "seconds", "runs": [{"index", "rows", "episodes"}, ...]}` or `{"error"}`.
+
+    Args:
+        missing: What could not be prepared, a line each: said where a name is not known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, missing: Sequence[str] = ()) -> None:
+        self.missing = missing
         self.programs: dict[tuple[Any, ...], Programs] = {}
 
     def run(self, job: Job) -> Reply:
@@ -48,6 +59,7 @@ class Worker:
         from experiments.engine.plan import plan
         from experiments.engine.settings import RunSettings
 
+        self._refuse_unknown(job["settings"])
         settings = RunSettings.from_json(job["settings"])
         programs = self._programs(settings, job["side_by_side"])
         chunks = plan(settings.config, settings.evaluate_every)
@@ -61,6 +73,29 @@ class Worker:
         compile_s = programs.compile_s - compiled
         seconds = time.perf_counter() - began - compile_s
         return {"compile_s": compile_s, "seconds": seconds, "runs": runs}
+
+    def _refuse_unknown(self, settings: Mapping[str, Any]) -> None:
+        """Say why a name that the parent knows is not known here."""
+        from envs.registry import known
+        from experiments.engine.runtime import UserError
+        from ppl_jax import algorithms, gates, predictors
+
+        given = settings["settings"]
+        for what, name, there in (
+            ("environment", settings["env"], known(settings["env"])),
+            ("method", settings["algorithm"], settings["algorithm"] in algorithms.registered()),
+            ("gate", given["gate"], given["gate"] in gates.registered_gates()),
+            (
+                "predictor",
+                given["predictor"],
+                given["predictor"] in predictors.registered_predictors(),
+            ),
+        ):
+            if not there:
+                why = "; ".join(self.missing) or (
+                    f"name the module that registers it in {VARIABLE}=MODULE"
+                )
+                raise UserError(f"a worker process does not know {what} {name!r}: {why}")
 
     def _programs(self, settings: RunSettings, side_by_side: bool) -> Programs:
         """The programs of these settings: the same for runs of most lengths."""
@@ -148,13 +183,32 @@ _SCORES = ("success", "episodic_return", "progress", "episodic_cost", "length")
 def serve() -> None:
     """Answer jobs, a line of JSON each, from standard input on what was standard output.
 
-    Whatever else prints goes to standard error.
+    The first line is the `Preparation`; its answer says that the worker is there. Until the last
+    one a sign of life comes every few seconds. Whatever else prints goes to standard error.
     """
     from experiments.engine.runtime import start_jax
 
     replies = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
+    lock, parent = threading.Lock(), os.getppid()
+
+    def say(reply: Reply) -> None:
+        with lock:
+            print(json.dumps(reply), file=replies, flush=True)
+
+    def live() -> None:
+        while True:
+            time.sleep(BEAT_S)
+            if os.getppid() != parent:  # it was killed: nobody waits for the run under way
+                os._exit(1)
+            say(ALIVE)
+
+    threading.Thread(target=live, daemon=True).start()
     start_jax()
-    worker = Worker()
+    worker = None
     for line in sys.stdin:
-        print(json.dumps(worker.run(json.loads(line))), file=replies, flush=True)
+        if worker is None:
+            worker = Worker(prepare(json.loads(line)))
+            say(READY)
+        else:
+            say(worker.run(json.loads(line)))

@@ -22,6 +22,7 @@ from ppl_jax.config import (
     world_ranges,
 )
 from ppl_jax.gates import gate
+from ppl_jax.plugins import note_caller
 from ppl_jax.predictors import predictor
 
 Changes = Callable[[EnvCard], Mapping[str, Any]]
@@ -114,6 +115,7 @@ def register(
     unknown = {*function(DEFAULT), *(tuned or {}), *(grid or {})} - known
     if unknown:
         raise ValueError(f"algorithm {name!r} changes unknown fields: {', '.join(sorted(unknown))}")
+    note_caller()
     _METHODS[name] = AlgorithmSpec(
         make=make,
         config=config,
