@@ -15,8 +15,8 @@ import tyro
 from tyro.conf import subcommand
 
 from envs.compiler import set_xla_flags
+from experiments.engine.preparation import SERVE, stop_if_preparing
 from experiments.engine.runtime import UserError, hide_compiler_logs
-from experiments.engine.schedulers import SERVE
 from experiments.options.commands import (
     Ablation,
     Bench,
@@ -40,13 +40,14 @@ from experiments.options.commands import (
     Tune,
     expert_command,
 )
-from ppl_jax import __version__
+from ppl_jax import __version__, plugins
 
 HELP_ALL = "--help-all"
 _ABOUT = (
     "Predictive preference learning from human interventions: train, compare, sweep, draw, take "
     "over. `ppl COMMAND --help` explains a command, `ppl list` names what they take, "
-    "`ppl --version` says the version."
+    "`ppl --version` says the version; `--import MODULE` anywhere first imports a module of yours "
+    "that registers environments or methods."
 )
 _PLAIN = {
     "evaluate": Evaluate,
@@ -307,13 +308,9 @@ def _expert_evaluate(command: ExpertEvaluate) -> None:
 
 
 def _export(command: Export) -> None:
-    import shutil
+    from experiments.engine.export import export
 
-    from experiments.engine.evaluate import policy_path, read_policy, run_spec
-
-    source = policy_path(command.run)
-    read_policy(source, run_spec(command.run))
-    shutil.copyfile(source, command.out)
+    export(command.run, command.out)
     print(f"wrote {command.out}")
 
 
@@ -413,9 +410,37 @@ def _list(command: List) -> None:
     print(listing())
 
 
-def _action(command: Any) -> Any:
-    """The function that runs a command; a generated class has the name of the one it extends."""
-    return _ACTIONS[type(command).__name__]
+def _import_named(words: list[str]) -> list[str]:
+    """Import the modules that `--import` and `PPL_JAX_IMPORT` name; returns the other words.
+
+    Raises:
+        UserError: If one cannot be imported.
+    """
+    names = list(plugins.named())
+    while "--import" in words:
+        at = words.index("--import")
+        if at + 1 == len(words):
+            raise UserError("--import: name a module that registers environments or methods")
+        names.append(words[at + 1])
+        words = words[:at] + words[at + 2 :]
+    try:
+        plugins.import_modules(names)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return words
+
+
+def _run(command: Any) -> None:
+    """Run a command, if the file that it writes can be; a generated class has its base's name."""
+    asked = getattr(command, "command", command)  # `ppl expert` has commands of its own
+    if isinstance(asked, _WRITES_A_FILE) and asked.out is not None:
+        from experiments.engine.files import check_out_file
+
+        check_out_file(asked.out)
+    _ACTIONS[type(command).__name__](command)
+
+
+_WRITES_A_FILE = (Bench, Evaluate, ExpertEvaluate, Export, Figure, Horizon, Recording, Render)
 
 
 _ACTIONS = {
@@ -444,6 +469,7 @@ _ACTIONS = {
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point; exits with 0, 1 (the run broke) or 2 (a mistake in what was asked for)."""
+    stop_if_preparing()
     set_xla_flags()  # first of all: XLA reads them once, when JAX is first used
     hide_compiler_logs()
     words = sys.argv[1:] if argv is None else argv
@@ -455,8 +481,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"ppl-jax {__version__}")
         return
     try:
-        command = parse(words)
-        _action(command)(command)
+        _run(parse(_import_named(words)))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

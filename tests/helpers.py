@@ -445,3 +445,12 @@ def success(world, made, learner):
     """Share of a probe's held-out scenarios that the learner's policy solves."""
     layers = made.algorithm.policy(learner.algorithm)
     return float(np.mean(_evaluation(world)(layers, jax.random.key(0)).success))
+
+
+def numpy_action(policy, observation):
+    """What a policy file does, in plain NumPy: [B, O] -> [B, A]."""
+    x = (observation - policy.obs_mean) / policy.obs_scale
+    between = {"relu": lambda x: np.maximum(x, 0), "tanh": np.tanh}[policy.activation]
+    for i, (w, b) in enumerate(policy.weights):
+        x = (between(x) if i else x) @ w + b
+    return np.tanh(x) if policy.output == "tanh" else np.clip(x, -1, 1)

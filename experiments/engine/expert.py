@@ -28,6 +28,7 @@ from experiments.engine.expert_settings import (
     check,
     read_settings,
 )
+from experiments.engine.ownership import owned
 from experiments.engine.policy_file import save_policy
 from experiments.engine.progress import Progress
 from experiments.engine.run import open_folder, record_of, restore_learner
@@ -68,25 +69,39 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
     """
     check(settings)
     began = time.perf_counter()
-    config, folder = settings.config, RunFolder(out)
-    env = build_env(settings)
+    folder, env = RunFolder(out), build_env(settings)
     try:
         teacher = env.experts.get(env.card.expert.teacher)
-        functions = make_ppo_lagrangian(env, config, expert=teacher)
+        functions = make_ppo_lagrangian(env, settings.config, expert=teacher)
     except ValueError as error:
         raise UserError(str(error)) from error
-    if resume:
-        before = read_settings(folder)
-        refuse_contradictions(out, one_level(before.as_json()), one_level(settings.as_json()))
-    else:
-        open_folder(folder, settings.as_json(), resume=False)
+    with owned(out):
+        if resume:
+            before = read_settings(folder)
+            refuse_contradictions(out, one_level(before.as_json()), one_level(settings.as_json()))
+        else:
+            open_folder(folder, settings.as_json(), resume=False)
+        return _train(settings, folder, env, functions, resume=resume, began=began)
+
+
+def _train(
+    settings: ExpertSettings,
+    folder: RunFolder,
+    env: Env,
+    functions: PPOFunctions,
+    *,
+    resume: bool,
+    began: float,
+) -> dict[str, Any]:
+    """The run in its folder, from the start or the last checkpoint; returns the summary."""
+    config = settings.config
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     done = 0
     if resume:
         done, learner = _restore(folder, learner)
         folder.rewind(done, done)
-        if done >= config.batches * config.batch_steps:
-            print(f"{out} is complete already ({done} steps)", file=sys.stderr)
+        if done >= config.batches * config.batch_steps and (folder.path / SUMMARY).is_file():
+            print(f"{folder.path} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
     first = done // config.batch_steps
     with Progress(config.batches * config.batch_steps, f"expert {settings.env}", done) as progress:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -25,12 +26,13 @@ from experiments.engine.evaluate import (
     rows_of,
     summarise_episodes,
 )
+from experiments.engine.ownership import owned
 from experiments.engine.plan import Chunk, plan
 from experiments.engine.policy_file import save_policy
 from experiments.engine.programs import NETWORK, Programs
 from experiments.engine.progress import Progress
 from experiments.engine.recorded import recorded_functions, recording_of
-from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
+from experiments.engine.run_folder import CONFIG, POLICY, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError, device, revision, versions
 from experiments.engine.settings import (
     RunSettings,
@@ -126,23 +128,30 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             f"evaluate_every must be a multiple of rollout_steps ({every}) for "
             f"{settings.algorithm}, got {settings.evaluate_every}"
         )
-    open_folder(folder, settings.as_json(), resume)
     interval = settings.config.decision_interval
     programs = Programs(env, functions, interval, on=settings.evaluate_on)
+    with owned(out):
+        open_folder(folder, settings.as_json(), resume)
+        return _train(settings, folder, programs, resume=resume, began=began)
+
+
+def _train(
+    settings: RunSettings, folder: RunFolder, programs: Programs, *, resume: bool, began: float
+) -> dict[str, Any]:
+    """The run in its folder, from the start or the last checkpoint; returns the summary."""
     learner = programs.init(jax.random.key(settings.seed), settings.hparams)
     chunks = plan(settings.config, settings.evaluate_every)
-    done = 0
+    runner, done = _Runner(settings, folder, programs), 0
     if resume:
         done, learner = restore_learner(folder, learner)
         evaluated = [chunk.step for chunk in chunks if chunk.evaluate and chunk.end <= done]
         folder.rewind(done, max(evaluated, default=-1))
-        if done >= chunks[-1].end:
-            print(f"{out} is complete already ({done} steps)", file=sys.stderr)
+        if done >= chunks[-1].end and (folder.path / SUMMARY).is_file():
+            print(f"{folder.path} is complete already ({done} steps)", file=sys.stderr)
             return folder.read_json(SUMMARY)
     with Progress(chunks[-1].end, f"train {settings.env}", done) as progress:
         name = f"{settings.algorithm} in {settings.where}"
         programs.announce = lambda what: progress.compiling(f"{name}, {what}")
-        runner = _Runner(settings, folder, programs)
         progress.start()
         for chunk in (chunk for chunk in chunks if chunk.end > done):
             learner, note = runner.run(learner, chunk)
@@ -181,17 +190,8 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
         asked = one_level(json.loads(json.dumps(content)))
         refuse_contradictions(folder.path, held, asked)
         return
-    try:
-        folder.create(
-            content
-            | {
-                "versions": versions(),
-                "device": device(),
-                "revision": revision(),
-            }
-        )
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    about = {"versions": versions(), "device": device(), "revision": revision()}
+    folder.create(content | about)
 
 
 _OLD_HPARAMS = (  # of a learner's checkpoint before config.json had a schema
@@ -231,11 +231,20 @@ _LATER = (
 )
 
 
-def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
+def restore_learner(folder: RunFolder, learner: Any, *, repeats: bool = False) -> tuple[int, Any]:
     """The newest whole checkpoint of a run folder as (done, learner); (0, `learner`) if none.
 
     A checkpoint of before schema 5 lacks the settings and counters of since, and from before
     config.json had a schema it holds them under other names.
+
+    Args:
+        folder: The run folder.
+        learner: At the start of the run.
+        repeats: Where no checkpoint can be read, what was done is repeated from another log. Else
+            a run that had one does not go back to its start.
+
+    Raises:
+        UserError: If it had one.
     """
     if hasattr(learner, "counters") and (schema := schema_of(folder.config())) < 5:
         names = {f.name: f.name for f in dataclasses.fields(Counters) if f.name not in _LATER}
@@ -248,7 +257,7 @@ def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
         counted = {then: getattr(learner.counters, name) for name, then in names.items()}
         parts |= {"hparams": hparams, "counters": record_of(counted)}
         old = record_of({name: part for name, part in parts.items() if name not in _LATER})
-        done, found = _restore(folder, old)
+        done, found = _restore(folder, old, repeats)
         if found is old:
             return 0, learner
         held = {name: getattr(found.counters, then) for name, then in names.items()}
@@ -256,7 +265,7 @@ def restore_learner(folder: RunFolder, learner: Any) -> tuple[int, Any]:
         found = {name: getattr(found, name) for name in parts if name not in _LATER}
         found |= {"hparams": learner.hparams, "counters": counters}
         return done, dataclasses.replace(learner, **found)
-    return _restore(folder, learner)
+    return _restore(folder, learner, repeats)
 
 
 def _without_later(settings: Any) -> Any:
@@ -279,15 +288,21 @@ def record_of(values: Mapping[str, Any]) -> Any:
     return flax.struct.dataclass(kind)(**values)
 
 
-def _restore(folder: RunFolder, learner: Any) -> tuple[int, Any]:
-
+def _restore(folder: RunFolder, learner: Any, repeats: bool) -> tuple[int, Any]:
     def warn(line: str) -> None:
         print(f"warning: {line}", file=sys.stderr)
 
     found = checkpoint.restore(folder.checkpoints, learner, warn)
-    if found is None:
-        return 0, learner  # killed before its first checkpoint: from the start
-    return found
+    if found is not None:
+        return found
+    if not repeats and (checkpoint.steps(folder.checkpoints) or folder.has_gone_on()):
+        run, new = shlex.quote(str(folder.path)), shlex.quote(f"{folder.path}-again")
+        raise UserError(
+            f"cannot resume {str(folder.path)!r}: it has no checkpoint that can be read, and is "
+            f"left as it is; start afresh with: mkdir {new} && cp {run}/{CONFIG} {new} && "
+            f"ppl train --resume --out {new}"
+        )
+    return 0, learner  # killed before its first checkpoint: from the start
 
 
 class _Runner:

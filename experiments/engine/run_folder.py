@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from experiments.engine.files import write_text_atomic
+from experiments.engine.files import as_json, make_out_folder, unusable, write_text_atomic
+from experiments.engine.runtime import UserError
 
 CONFIG, METRICS, EVALUATION, SUMMARY, CHECKPOINTS, POLICY = (
     "config.json",
@@ -34,16 +35,18 @@ class RunFolder:
         """Make the folder and write config.json.
 
         Raises:
-            ValueError: If the folder already holds a run.
-            OSError: If it cannot be written.
+            UserError: If the folder already holds a run, or cannot be written.
         """
         if (self.path / CONFIG).exists():
-            raise ValueError(
+            raise UserError(
                 f"out folder {str(self.path)!r} already holds a run: give --resume to continue "
                 "it, or another --out"
             )
-        self.path.mkdir(parents=True, exist_ok=True)
-        self.write_json(CONFIG, config)
+        make_out_folder(self.path)
+        try:
+            self.write_json(CONFIG, config)
+        except OSError as error:
+            raise unusable(self.path, error) from error
 
     def config(self) -> dict[str, Any]:
         """Read config.json.
@@ -60,7 +63,7 @@ class RunFolder:
 
     def write_json(self, name: str, content: Any) -> None:
         """Replace a JSON file in one step."""
-        write_text_atomic(self.path / name, json.dumps(content, indent=2) + "\n")
+        write_text_atomic(self.path / name, as_json(content, indent=2) + "\n")
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file of the folder."""
@@ -68,18 +71,26 @@ class RunFolder:
 
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append one line to metrics.jsonl."""
-        with open(self.path / METRICS, "a") as file:
-            file.write(json.dumps(row) + "\n")
+        with open(self.path / METRICS, "a", newline="") as file:
+            file.write(as_json(row) + "\n")
 
     def append_evaluation(self, rows: list[dict[str, Any]]) -> None:
         """Append rows to evaluation.csv (with a header when new)."""
         path = self.path / EVALUATION
         new = not path.exists()
         with open(path, "a", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             if new:
                 writer.writeheader()
             writer.writerows(rows)
+
+    def has_gone_on(self) -> bool:
+        """Whether a second evaluation was logged: a checkpoint was written after the first."""
+        evaluation = self.path / EVALUATION
+        if not evaluation.is_file():
+            return False
+        with open(evaluation, newline="") as file:
+            return len({row["step"] for row in csv.DictReader(file)}) > 1
 
     def rewind(self, done: int, step: int) -> None:
         """Drop what was logged later: a resumed run writes it again.

@@ -18,6 +18,7 @@ from experiments.engine.evaluate import (
     summarise_episodes,
 )
 from experiments.engine.expert_settings import read_settings
+from experiments.engine.files import as_json, write_text_atomic
 from experiments.engine.run_folder import METRICS, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
 from experiments.options.expert import command_of
@@ -69,7 +70,7 @@ def write_card(run: Path, out: Path, *, force: bool = False) -> None:
         "versions": config["versions"],
         "revision": config["revision"],
     }
-    (out / f"{env}.json").write_text(json.dumps(card, indent=2) + "\n")
+    write_text_atomic(out / f"{env}.json", as_json(card, indent=2) + "\n")
 
 
 def refuse_to_overwrite(out: Path, env: str, *, force: bool) -> None:
@@ -96,7 +97,7 @@ def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:
         batches = [line for line in logged if before < line["step"] <= step]
         line: dict[str, Any] = {"step": step}
         for name in TRAINING:
-            values = [b[f"train/{name}"] for b in batches if f"train/{name}" in b]
+            values = [value for b in batches if (value := b.get(f"train/{name}")) is not None]
             line[f"train_{name}"] = f"{sum(values) / len(values):.5g}" if values else ""
         scores = summarise_episodes([row for row in rows if row.step == step])
         line |= {f"held_out_{name}": f"{value:.5g}" for name, value in scores.items()}

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from experiments.engine.files import write_text_atomic
 from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RENAMED, RENAMED_VALUES
@@ -182,7 +183,7 @@ def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     import pandas as pd
 
     frame = pd.DataFrame(list(rows), columns=list(rows[0]), dtype=object)
-    frame.to_csv(path, index=False, lineterminator="\n")
+    write_text_atomic(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def _read_run(path: Path) -> Frame:

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 from envs.registry import known, unknown
 from experiments.engine import compile_log
 from experiments.engine import schedulers as engines
-from experiments.engine.files import write_text_atomic
+from experiments.engine.files import as_json, unusable, write_text_atomic
+from experiments.engine.ownership import LOCK, owned
+from experiments.engine.preparation import stop_if_preparing
 from experiments.engine.progress import Progress
 from experiments.engine.runtime import UserError, revision, versions
 from experiments.engine.settings import (
@@ -213,6 +215,7 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
     Raises:
         UserError: If a setting is wrong, or a run failed (the others are run all the same).
     """
+    stop_if_preparing()
     for name, least in (("processes", 1), ("batch", 1)):
         value = getattr(execution, name)
         if value is not None and value < least:
@@ -221,6 +224,13 @@ def execute(runs: Sequence[Run], out: Path, execution: Execution) -> None:
     if execution.dry_run:
         _tell_plan(runs, runs, execution)
         return
+    with owned(out):
+        _execute(runs, results, execution)
+
+
+def _execute(runs: Sequence[Run], results: Results, execution: Execution) -> None:
+    """`execute` in a folder that is this process's own."""
+    out = results.out
     before = _open(out, {run.name: _json(run.settings) for run in runs})
     done = results.read(before)
     waiting = [run for run in runs if run.name not in done]
@@ -272,7 +282,7 @@ def _json(settings: RunSettings) -> dict[str, Any]:
 
 
 def _open(out: Path, asked: dict[str, Any]) -> dict[str, Any]:
-    """Make the folder of a sweep, or check that what is in it has the same settings.
+    """Take a folder for a sweep, or check that what is in it has the same settings.
 
     More runs (seeds, values, axes) may join; those that are there must be the same.
 
@@ -285,7 +295,7 @@ def _open(out: Path, asked: dict[str, Any]) -> dict[str, Any]:
     path = out / SETTINGS
     before: dict[str, Any] = {}
     if path.is_file():
-        before = json.loads(path.read_text())["runs"]
+        before = _read_settings(path)
         for name in asked.keys() & before.keys():
             held, wanted = one_level(before[name]), one_level(asked[name])
             for field, value in wanted.items():
@@ -294,12 +304,31 @@ def _open(out: Path, asked: dict[str, Any]) -> dict[str, Any]:
                         f"{str(out)!r} holds {name} with {field} {held.get(field)!r}, asked for "
                         f"{value!r}: give another --out"
                     )
-    elif out.is_dir() and any(out.iterdir()):
+    elif any(held.name != LOCK for held in out.iterdir()):
         raise UserError(f"{str(out)!r} holds something else: give another --out")
-    out.mkdir(parents=True, exist_ok=True)
     content = {"versions": versions(), "revision": revision(), "runs": before | asked}
-    write_text_atomic(path, json.dumps(content, indent=1) + "\n")
+    try:
+        write_text_atomic(path, as_json(content, indent=1) + "\n")
+    except OSError as error:
+        raise unusable(out, error) from error
     return before
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    """The settings of the runs in a sweep.json by name.
+
+    Raises:
+        UserError: If it holds none.
+    """
+    try:
+        runs = json.loads(path.read_text())["runs"]
+        if not all(isinstance(held, dict) for held in runs.values()):
+            raise TypeError("runs must hold objects")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{str(path)!r} cannot be read ({type(error).__name__}: {error}): give another --out"
+        ) from error
+    return runs
 
 
 _MAY_DIFFER = ("schema", "max_preference_horizon")  # the second only bounds L

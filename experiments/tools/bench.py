@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import resource
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import numpy as np
 
 from envs.driving.make import make_driving
 from envs.registry import make
+from experiments.engine.files import as_json, write_text_atomic
 from experiments.engine.runtime import device, versions
 from experiments.report.tables import print_table
 from experiments.tools.bench_growth import bench_growth, no_update
@@ -89,9 +89,8 @@ def bench(repeats: int, parts: tuple[str, ...], out: Path | None) -> dict[str, A
     figures["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     print_table(["figure", "value"], [[k, f"{v:,.4g}"] for k, v in figures.items()])
     if out is not None:
-        out.write_text(
-            json.dumps(figures | {"versions": versions(), "device": device()}, indent=2) + "\n"
-        )
+        about = {"versions": versions(), "device": device()}
+        write_text_atomic(out, as_json(figures | about, 2) + "\n")
     return figures
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.ownership import owned
 from experiments.engine.run import build_env, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
@@ -44,7 +45,7 @@ def play(
     from experiments.ui.session import Session
     from experiments.ui.trainer import InteractiveTrainer
 
-    with server.listen(host, port, exposed) as served:
+    with server.listen(host, port, exposed) as served, owned(out):
         env = build_env(settings)
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)

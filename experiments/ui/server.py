@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
-import json
 import secrets
 import socket
 import sys
@@ -28,6 +27,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from experiments.engine.files import as_json
 from experiments.engine.runtime import UserError
 from experiments.ui.protocol import LONGEST, Allowance, Malformed, Message, Order, parse
 
@@ -143,7 +143,7 @@ class Hub:
 
     def publish(self, message: dict[str, Any]) -> None:
         """To every page."""
-        self._post(str(message["kind"]), json.dumps(message, separators=(",", ":")))
+        self._post(str(message["kind"]), as_json(message))
 
     def picture(self, number: int, jpeg: bytes) -> None:
         """To every page: four bytes of the frame's number, then the picture."""
@@ -165,8 +165,8 @@ class Hub:
         """Add a page and send it the present state."""
         assert self.backend is not None
         mailbox = self.pages[page] = _Mailbox()
-        mailbox.put("about", json.dumps(self.backend.about()))
-        mailbox.put("status", json.dumps(self.backend.status()))
+        mailbox.put("about", as_json(self.backend.about()))
+        mailbox.put("status", as_json(self.backend.status()))
         for kind in ("scene", "frame", "picture"):
             if kind in self.kept:
                 mailbox.put(kind, self.kept[kind])
@@ -190,7 +190,7 @@ class Hub:
         for page, mailbox in self.pages.items():
             role = {"kind": "role", "control": page is self.controller}
             role |= {"free": self.controller is None, "watching": len(self.pages) - 1}
-            mailbox.put("role", json.dumps(role))
+            mailbox.put("role", as_json(role))
 
     def hear(self, page: WebSocket, text: str | bytes) -> None:
         """Check a message of a page and pass it on."""
@@ -215,7 +215,7 @@ class Hub:
     def _reject(self, page: WebSocket, why: str) -> None:
         self.rejected += 1
         if self.rejected % 100 == 1:  # one line for many
-            self.pages[page].put("rejected", json.dumps({"kind": "rejected", "why": why}))
+            self.pages[page].put("rejected", as_json({"kind": "rejected", "why": why}))
 
 
 def make_app(hub: Hub, hosts: list[str]) -> Starlette:

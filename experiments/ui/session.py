@@ -7,7 +7,6 @@ Nothing here depends on the web; a test can play the person.
 from __future__ import annotations
 
 import dataclasses
-import json
 import queue
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.engine.files import as_json
 from experiments.ui.config import SessionConfig
 from experiments.ui.protocol import Answers, Consent, Input, Message, Order
 from experiments.ui.trainer import InteractiveTrainer
@@ -259,7 +259,7 @@ class Session:
 
     def _write(self, name: str, row: dict[str, Any]) -> None:
         with open(self.trainer.folder.path / name, "a") as file:
-            file.write(json.dumps(row | {"time": round(time.time(), 3)}) + "\n")
+            file.write(as_json(row | {"time": round(time.time(), 3)}) + "\n")
 
     # a tick
 

@@ -25,6 +25,7 @@ from experiments.engine.evaluate import (
     read_evaluation,
     summarise_episodes,
 )
+from experiments.engine.files import as_json
 from experiments.engine.policy_file import save_policy
 from experiments.engine.recording import PredictedPath, Recorder
 from experiments.engine.run import algorithm_factory, restore_learner, saved_policy
@@ -127,7 +128,7 @@ class InteractiveTrainer:
     def _resume(self, report: Report) -> None:
         """Restore the last checkpoint and repeat the steps since."""
         lines = _whole_lines(self.folder.path / LOG)
-        done, self.learner = restore_learner(self.folder, self.learner)
+        done, self.learner = restore_learner(self.folder, self.learner, repeats=True)
         self.events = self._saved = done
         self.steps = int(self.learner.counters.steps)
         self.recorder.rewind(done)
@@ -187,7 +188,7 @@ class InteractiveTrainer:
         takeover = takeover or self.manual
         action = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
         row = {"do": "step", "takeover": takeover, "action": action.tolist()}
-        self._file.write(json.dumps(row | about) + "\n")
+        self._file.write(as_json(row | about) + "\n")
         step = self._make_step(takeover, action)
         self.events += 1
         return step
@@ -226,7 +227,7 @@ class InteractiveTrainer:
 
     def restart(self) -> None:
         """Leave the episode unfinished and start the next."""
-        self._file.write(json.dumps({"do": "restart"}) + "\n")
+        self._file.write(as_json({"do": "restart"}) + "\n")
         self._make_restart()
         self.events += 1
 

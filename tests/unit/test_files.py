@@ -1,0 +1,134 @@
+"""Files that are written whole, folders that have one owner, policies for other programs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments.engine.export import export, to_onnx
+from experiments.engine.files import as_json, check_out_file, make_out_folder, write_atomic
+from experiments.engine.ownership import owned
+from experiments.engine.policy_file import save_policy
+from experiments.engine.run_folder import RunFolder
+from experiments.engine.runtime import UserError
+from ppl_jax.experts import SavedPolicy
+from tests.helpers import ROOT, numpy_action
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from experiments.engine.ownership import owned
+with owned(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(100)
+"""
+
+
+def test_json_is_strict():
+    content = {"a": [1.5, float("nan")], "b": {"c": float("-inf")}, "d": (1, True, None, "NaN")}
+    read = json.loads(as_json(content), parse_constant=pytest.fail)
+    assert read == {"a": [1.5, None], "b": {"c": None}, "d": [1, True, None, "NaN"]}
+
+
+def test_metrics_of_a_loss_that_is_not_finite_are_json(tmp_path):
+    RunFolder(tmp_path).append_metrics({"step": 1, "train/bc_loss": float("inf")})
+    line = (tmp_path / "metrics.jsonl").read_text()
+    assert json.loads(line, parse_constant=pytest.fail) == {"step": 1, "train/bc_loss": None}
+
+
+def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path):
+    path = tmp_path / "x"
+    path.write_text("before")
+
+    def fail(file):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"):
+        write_atomic(path, fail)
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("place", ["/proc/nowhere/x", "{}/file/x", "/dev/null/x"])
+def test_a_path_that_cannot_be_is_refused_before_the_work(place, tmp_path):
+    (tmp_path / "file").touch()
+    path = tmp_path.__class__(place.format(tmp_path))
+    for check in (make_out_folder, check_out_file):
+        with pytest.raises(UserError, match="cannot be written: ") as told:
+            check(path)
+        assert len(str(told.value).splitlines()) == 1
+    with pytest.raises(UserError, match="cannot be written: "), owned(path):
+        pytest.fail("a folder was made there")
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(UserError, match="is a folder: name a file"):
+        check_out_file(tmp_path)
+    check_out_file(tmp_path / "new" / "file.csv")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_a_folder_has_one_owner_and_a_dead_one_does_not_block(tmp_path):
+    folder = tmp_path / "run"
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdout is not None
+    with other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(UserError) as told, owned(folder):
+            pytest.fail("two owners")
+        assert f"out {str(folder)!r} is being written by process {other.pid} on " in str(told.value)
+        assert len(str(told.value).splitlines()) == 1
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+    with owned(folder), pytest.raises(UserError, match=f"process {os.getpid()}"), owned(folder):
+        pytest.fail("twice in one process")
+    with pytest.raises(ZeroDivisionError), owned(folder):
+        raise ZeroDivisionError  # an error lets go of it too
+    with owned(folder):
+        pass
+
+
+def random_policy(activation, output):
+    rng = np.random.default_rng(3)
+    sizes = [(5, 8), (8, 8), (8, 2)]
+    return SavedPolicy(
+        weights=[(rng.normal(size=s) / 3, rng.normal(size=s[1]) / 3) for s in sizes],
+        activation=activation,
+        output=output,
+        obs_mean=rng.normal(size=5),
+        obs_scale=rng.uniform(0.5, 2.0, 5),
+    )
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("output", ["tanh", "clip"])
+def test_an_onnx_policy_acts_like_the_numpy_one(activation, output):
+    runtime = pytest.importorskip("onnxruntime")
+    policy = random_policy(activation, output)
+    model = to_onnx(policy, {"env": "toy", "step": 7})
+    session = runtime.InferenceSession(model.SerializeToString())
+    observation = np.random.default_rng(4).normal(size=(6, 5)).astype(np.float32)
+    (action,) = session.run(None, {"observation": observation})
+    assert action.shape == (6, 2)
+    expected = numpy_action(policy, observation)
+    np.testing.assert_allclose(action, expected, atol=1e-5)
+    assert expected.std() > 0.1
+    assert {one.key: one.value for one in model.metadata_props} == {"env": '"toy"', "step": "7"}
+
+
+@pytest.mark.parametrize("name", ["policy.pt", "policy", "policy.npz.gz", "policy.ONNX"])
+def test_other_kinds_of_policy_files_are_refused(name, tmp_path):
+    save_policy(tmp_path / "p.npz", random_policy("relu", "tanh"), {"env": "driving"})
+    with pytest.raises(UserError, match=r"out must end in \.npz or \.onnx, got "):
+        export(tmp_path / "p.npz", tmp_path / name)
+    assert not (tmp_path / name).exists()
