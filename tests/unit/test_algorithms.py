@@ -11,9 +11,10 @@ import pytest
 from ppl_jax import buffers
 from ppl_jax.algorithms import eil, gail, haco, ppl, pvp, replay, thrifty_dagger
 from ppl_jax.algorithms.ensemble_dagger import ensemble_variance
-from ppl_jax.config import HParams
+from ppl_jax.config import HParams, as_arrays
 from ppl_jax.distributions import surrogate
 from ppl_jax.experts import SavedPolicy, act
+from ppl_jax.interaction import learn
 from ppl_jax.networks import (
     ensemble_layers,
     layers,
@@ -24,7 +25,7 @@ from ppl_jax.networks import (
 )
 from ppl_jax.policies import Novice
 from ppl_jax.types import PreferenceBatch
-from tests.helpers import Probe, plain_settings, probe_settings
+from tests.helpers import Probe, functions, plain_settings, probe_settings
 
 RNG = np.random.default_rng(1)
 B, K, A = 6, 2, 3
@@ -372,3 +373,38 @@ def test_batches_of_eil_and_thrifty_dagger():
     assert not np.any(thrifty_dagger.sample_steps(state, key, key, 20).success)
     state = dataclasses.replace(state, goals=buffers.add(state.goals, goal, jnp.ones(1, bool)))
     assert int(np.sum(thrifty_dagger.sample_steps(state, key, key, 20).success)) == 2
+
+
+# --- what no update can do ---
+
+
+@pytest.mark.parametrize("part", ["loss", "params", "opt_state", "average"])
+def test_an_update_that_leaves_a_number_that_is_not_finite_changes_nothing(part):
+    learner = functions("ppl")[0].init(jax.random.key(0), HParams(method=ppl.PPLHParams()))
+
+    def update(state, key, hparams):
+        learned = jax.tree.map(lambda leaf: leaf + 1, state.learned)
+        loss = jnp.where(part == "loss", jnp.inf, 1.0)
+        if part != "loss":
+            sick = jax.tree.map(lambda leaf: leaf * jnp.nan, getattr(learned, part))
+            learned = dataclasses.replace(learned, **{part: sick})
+        return dataclasses.replace(state, learned=learned), {"bc_loss": loss}
+
+    after, _ = learn(learner, update)
+    assert bool(after.diverged)
+    before = learner.algorithm.learned
+    for old, new in zip(*map(jax.tree.leaves, (before, after.algorithm.learned)), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_an_l_beyond_the_program_is_refused_or_where_it_is_traced_flagged():
+    made, hparams = functions("ppl", max_preference_horizon=4)
+    method = dataclasses.replace(hparams.method, preference_horizon=5)
+    beyond = dataclasses.replace(hparams, method=method)
+    with pytest.raises(ValueError, match=r"must not exceed max_preference_horizon \(4\), got 5"):
+        made.init(jax.random.key(0), beyond)
+    learner = made.init(jax.random.key(0), hparams)
+    update = jax.jit(made.algorithm.update)
+    for asked, flag in ((hparams, 0.0), (beyond, 1.0)):
+        _, metrics = update(learner.algorithm, jax.random.key(1), as_arrays(asked))
+        assert float(metrics["horizon_cut"]) == flag

@@ -163,6 +163,8 @@ def test_unknown_states_and_shapes_that_do_not_fit_are_refused():
         ValueError, match="one of predicted, future, shifted, got 'shift': did you mean"
     ):
         preference_pairs(step, 3, "shift")
+    with pytest.raises(ValueError, match=rf"must not exceed the predicted states \({M}\), got 9"):
+        preference_pairs(step, 9)
     for wrong in (
         {"observation": jnp.zeros(O + 1)},
         {"novice_action": jnp.zeros((1, A))},
