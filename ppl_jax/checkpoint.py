@@ -74,12 +74,10 @@ def save(folder: Path, step: int, tree: PyTree) -> None:
         shutil.rmtree(part, ignore_errors=True)
         full = "No space left on device" in str(error)
         reason = "no space left on device" if full else str(error).splitlines()[0]
-        kept = steps(folder)
-        rest = f"checkpoint {kept[-1]} is whole, continue from it with --resume"
-        raise OSError(
-            f"cannot write checkpoint {step} in {folder}: {reason}; "
-            + (rest if kept else "nothing of this run was saved")
-        ) from error
+        rest = "it was to be the first, --resume begins again"
+        if kept := steps(folder):
+            rest = f"checkpoint {kept[-1]} is whole, continue from it with --resume"
+        raise OSError(f"cannot write checkpoint {step} in {folder}: {reason}; {rest}") from error
     for old in steps(folder)[:-KEPT]:
         shutil.rmtree(folder / f"{_PREFIX}{old}", ignore_errors=True)
 
