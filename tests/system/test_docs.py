@@ -179,3 +179,11 @@ def test_hooks_and_hosted_ci_run_what_the_makefile_runs():
     assert {"make check", "make docs", "make test"} <= set(steps)
     repos = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     assert [repo["repo"] for repo in repos] == ["local"]  # works without a network
+
+
+def test_every_test_that_the_pages_name_is_there():
+    for page in (ROOT / "docs" / "pages").glob("*.md"):
+        for file, name in re.findall(r"`?(test_\w+\.py)(?:::(\w+))?", page.read_text()):
+            found = list((ROOT / "tests").rglob(file))
+            assert len(found) == 1, f"{page.name} names {file}"
+            assert not name or f"def {name}(" in found[0].read_text(), f"{page.name} names {name}"
