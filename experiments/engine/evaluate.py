@@ -14,10 +14,11 @@ import numpy as np
 
 from envs import pretrained
 from envs.registry import make
+from experiments.engine.fields import read_fields
 from experiments.engine.policy_file import load_meta, load_policy
-from experiments.engine.run_folder import EVALUATION, POLICY, RunFolder
+from experiments.engine.run_folder import EVALUATION, POLICY
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import RunSettings
+from experiments.engine.settings import read_config, read_run_settings, str_of_config
 from ppl_jax import experts
 from ppl_jax.config import HParams, as_arrays, env_params
 from ppl_jax.evaluation import Episodes, make_evaluate
@@ -163,15 +164,13 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
             meta = load_meta(run)
         except ValueError as error:
             raise UserError(str(error)) from error
-        if not isinstance(meta, dict) or "env" not in meta:
+        if not isinstance(meta, dict) or not isinstance(meta.get("env"), str):
             raise UserError(f"policy file {str(run)!r} cannot be read: its meta names no env")
         return meta["env"], {}
-    try:
-        config = RunFolder(run).config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    config = read_config(run)
+    read_fields(config, {}, str_of_config(run), needed=("env",))
     names = ("scenarios", "held_out_scenarios")
-    options = {name: config[name] for name in names if config[name] is not None}
+    options = {name: value for name in names if (value := config.get(name)) is not None}
     return config["env"], {"physics": run_physics(config), **options}
 
 
@@ -183,12 +182,8 @@ def run_hparams(run: Path) -> HParams | None:
     """
     if run.is_file():
         return None
-    try:
-        config = RunFolder(run).config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    randomised = config.get("settings", {}).get("randomise", False)
-    return RunSettings.from_json(config).hparams if randomised else None
+    randomised = read_config(run).get("settings", {}).get("randomise", False)
+    return read_run_settings(run).hparams if randomised else None
 
 
 def run_physics(config: Mapping[str, Any]) -> str:

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from envs.registry import check_physics, known, unknown
-from experiments.engine.run_folder import RunFolder
+from experiments.engine.fields import read_fields
+from experiments.engine.run_folder import CONFIG, RunFolder
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import MAX_SEED, SCHEMA, schema_of
+from experiments.engine.settings import (
+    MAX_SEED,
+    SCHEMA,
+    checked_content,
+    of_their_kinds,
+    read_config,
+    schema_of,
+    str_of_config,
+)
 from ppl_jax.cards import card
-from ppl_jax.ppo.config import PPOConfig, PPOHParams, catalogue, read, replace, validate
+from ppl_jax.ppo.config import OLD_NAMES, PPOConfig, PPOHParams, catalogue, read, replace, validate
 
 ALGORITHM = "ppo_lagrangian"  # in config.json
 FIRST_SCENARIO = 10_000  # of those an expert trains on: neither the novice's nor held out
@@ -50,20 +60,30 @@ class ExpertSettings:
         return {"schema": SCHEMA, **plain, "algorithm": ALGORITHM, "settings": settings}
 
     @staticmethod
-    def from_json(content: Mapping[str, Any]) -> ExpertSettings:
+    def from_json(content: Mapping[str, Any], where: str = CONFIG) -> ExpertSettings:
         """The inverse of `as_json`, of older versions too; ignores what else config.json holds.
 
+        What it lacks and has a default is that.
+
+        Args:
+            content: Content of config.json.
+            where: The file, for messages.
+
         Raises:
-            UserError: If it is of a newer version, or holds what no version has.
+            UserError: One line naming file and field: it is of a newer version, lacks what has no
+                default, or holds what no version has or what is of another kind.
         """
-        schema = schema_of(content)
+        schema = schema_of(checked_content(content, where), where)
+        parts = ("config", "hparams") if schema == 1 else ("settings",)
+        plain = read_fields(content, _KINDS, where, needed=("env", "seed", *parts))
+        given = {name: value for part in parts for name, value in content[part].items()}
+        given = {str(OLD_NAMES.get(name, name)): value for name, value in given.items()}
         try:
-            found = content["config"] | content["hparams"] if schema == 1 else content["settings"]
-            config, hparams = read(found)
-            plain = {name: content[name] for name in PLAIN if name in content}
-            return ExpertSettings(**plain, config=config, hparams=hparams)
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"config.json cannot be read: {error}") from error
+            known = catalogue(PPOConfig(), PPOHParams())
+            config, hparams = read(of_their_kinds(given, known))
+        except ValueError as error:
+            raise UserError(f"{where}: {error}") from error
+        return ExpertSettings(**plain, config=config, hparams=hparams)
 
 
 PLAIN = tuple(
@@ -72,6 +92,7 @@ PLAIN = tuple(
     if field.name not in ("config", "hparams")
 )
 """The fields of `ExpertSettings` beside the settings of PPO-Lagrangian."""
+_KINDS = {name: typing.get_type_hints(ExpertSettings)[name] for name in PLAIN}
 
 
 def read_settings(folder: RunFolder) -> ExpertSettings:
@@ -80,16 +101,13 @@ def read_settings(folder: RunFolder) -> ExpertSettings:
     Raises:
         UserError: If it is no run folder of `ppl expert train`.
     """
-    try:
-        content = folder.config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    content = read_config(folder.path)
     if content.get("algorithm") != ALGORITHM:
         raise UserError(
             f"{str(folder.path)!r} is a run of {content.get('algorithm')}, not of "
             "`ppl expert train`"
         )
-    return ExpertSettings.from_json(content)
+    return ExpertSettings.from_json(content, str_of_config(folder.path))
 
 
 def flat(config: PPOConfig, hparams: PPOHParams) -> dict[str, Any]:

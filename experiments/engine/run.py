@@ -26,6 +26,7 @@ from experiments.engine.evaluate import (
     rows_of,
     summarise_episodes,
 )
+from experiments.engine.fields import read_fields
 from experiments.engine.ownership import owned
 from experiments.engine.plan import Chunk, plan
 from experiments.engine.policy_file import save_policy
@@ -38,8 +39,10 @@ from experiments.engine.settings import (
     RunSettings,
     check,
     one_level,
+    read_config,
     refuse_contradictions,
     schema_of,
+    str_of_config,
 )
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.cards import card
@@ -182,10 +185,8 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
         UserError: If it cannot be made, or differs.
     """
     if resume:
-        try:
-            before = folder.config()
-        except ValueError as error:
-            raise UserError(str(error)) from error
+        before = read_config(folder.path)
+        read_fields(before, {}, str_of_config(folder.path), needed=("env", "algorithm", "seed"))
         held = one_level(before)
         asked = one_level(json.loads(json.dumps(content)))
         refuse_contradictions(folder.path, held, asked)

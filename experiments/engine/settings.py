@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from envs.registry import check_physics, known, unknown
+from experiments.engine.fields import of_kind, read_fields, shown
+from experiments.engine.run_folder import CONFIG, RunFolder
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.cards import card
 from ppl_jax.config import (
     HParams,
+    Setting,
     TrainConfig,
     catalogue,
     did_you_mean,
@@ -93,20 +98,31 @@ class RunSettings:
         return {"schema": SCHEMA} | content | {"settings": flat(self.config, self.hparams)}
 
     @staticmethod
-    def from_json(content: Mapping[str, Any]) -> RunSettings:
+    def from_json(content: Mapping[str, Any], where: str = CONFIG) -> RunSettings:
         """The inverse of `as_json`, of older versions too; ignores what else config.json holds.
 
+        What it lacks and has a default is that.
+
+        Args:
+            content: Content of config.json.
+            where: The file, for messages.
+
         Raises:
-            UserError: If it is of a newer version, or holds what no version has.
+            UserError: One line naming file and field: it is of a newer version, lacks what has no
+                default, or holds what no version has or what is of another kind.
         """
-        schema = schema_of(content)
+        schema = schema_of(checked_content(content, where), where)
+        parts = ("config", "hparams") if schema == 1 else ("settings",)
+        kinds = dict.fromkeys(parts, dict) | _KINDS
         content = as_it_was(content)
+        given = read_fields(content, kinds, where, needed=(*_NEEDED, *parts))
+        given = {name: value for name, value in given.items() if name in _PLAIN}
         try:
-            given = {name: content[name] for name in _PLAIN}
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
             config, hparams = with_values(given["env"], given["algorithm"], found)
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"config.json cannot be read: {error}") from error
+        except ValueError as error:
+            raise UserError(f"{where}: {error}") from error
+        given.setdefault("evaluate_every", default_interval(config))
         return RunSettings(**given, config=config, hparams=hparams)
 
 
@@ -115,6 +131,51 @@ _PLAIN = tuple(
     for field in dataclasses.fields(RunSettings)
     if field.name not in ("config", "hparams")
 )
+_KINDS = {name: typing.get_type_hints(RunSettings)[name] for name in _PLAIN}
+_NEEDED = ("env", "algorithm", "seed")
+_PARTS = dict.fromkeys(("settings", "config", "hparams", "session"), dict)
+# beside the settings: what a run is that says nothing of them
+_UNSAID = {
+    field.name: field.default
+    for field in dataclasses.fields(RunSettings)
+    if field.default is not dataclasses.MISSING and field.name != "evaluate_every"
+}
+
+
+def checked_content(content: Any, where: str) -> dict[str, Any]:
+    """The content of a config.json of any kind of run, of any version, as it is.
+
+    Raises:
+        UserError: One line naming file and field, if it is no object or a field is of another kind.
+    """
+    read_fields(content, {**_KINDS, **_PARTS, "schema": int}, where)
+    switches = {"physics": str, "randomise": bool}
+    for part in (content, content.get("settings", {})):
+        read_fields(part, switches, where)
+    return content
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The content of config.json of a run folder, of any kind and version.
+
+    Raises:
+        UserError: One line, if it is no run folder or a field is of another kind.
+    """
+    try:
+        content = RunFolder(path).config()
+    except (ValueError, RecursionError) as error:
+        raise UserError(str(error)) from error
+    return checked_content(content, str_of_config(path))
+
+
+def read_run_settings(path: Path) -> RunSettings:
+    """The settings of the run in a folder (see `RunSettings.from_json`)."""
+    return RunSettings.from_json(read_config(path), str_of_config(path))
+
+
+def str_of_config(path: Path) -> str:
+    """A run folder's config.json as messages name it."""
+    return repr(str(path / CONFIG))
 
 
 def program_key(settings: RunSettings) -> tuple[str, ...]:
@@ -138,8 +199,9 @@ def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     schema, held = schema_of(content), "settings" if "settings" in content else "config"
     settings = dict(content.get(held, {}))
-    if schema < 3 and {"human_capacity", "total_steps"} <= settings.keys():
-        settings["human_capacity"] = min(settings["human_capacity"], settings["total_steps"])
+    rows, steps = (settings.get(name) for name in ("human_capacity", "total_steps"))
+    if schema < 3 and isinstance(rows, int) and isinstance(steps, int):
+        settings["human_capacity"] = min(rows, steps)
     if schema < 4 and settings.get("pair_states") == "predicted":
         settings["pair_states"] = "future"
     if schema < 5 and "likelihood" in settings:
@@ -147,7 +209,7 @@ def as_it_was(content: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**content, held: settings} if held in content else content
 
 
-def schema_of(content: Mapping[str, Any]) -> int:
+def schema_of(content: Mapping[str, Any], where: str = CONFIG) -> int:
     """The schema version of a config.json; the first wrote none.
 
     Raises:
@@ -156,9 +218,11 @@ def schema_of(content: Mapping[str, Any]) -> int:
     schema = content.get("schema", 1)
     if schema > SCHEMA:
         raise UserError(
-            f"config.json has schema {schema}; this version reads up to {SCHEMA}: it was "
+            f"{where} has schema {schema}; this version reads up to {SCHEMA}: it was "
             "written by a newer ppl-jax"
         )
+    if schema < 1:
+        raise UserError(f"{where}: schema must be 1 to {SCHEMA}, got {schema}")
     return schema
 
 
@@ -181,18 +245,35 @@ def with_values(env: str, algorithm: str, given: Mapping[str, Any]) -> tuple[Tra
     """The settings of a run in an environment from all of their values.
 
     Raises:
-        ValueError: If one is unknown, or the environment cannot be randomised as they say.
+        ValueError: If one is unknown or of another kind, or the environment cannot be randomised
+            as they say.
     """
     spec = algorithms.method(algorithm)
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
     config = TrainConfig(method=spec.config())
+    given = of_their_kinds(given, catalogue(config, HParams(method=spec.hparams())))
     hparams = HParams(
         method=spec.hparams(),
         gate=gate(given.get("gate", config.gate)).hparams(),
         predictor=predictor(given.get("predictor", config.predictor)).hparams(),
         world=world_ranges(env, given.get("randomise", config.randomise)),
     )
-    return replace(config, hparams, **given)
+    return replace(config, hparams, **of_their_kinds(given, catalogue(config, hparams)))
+
+
+def of_their_kinds(given: Mapping[str, Any], known: Mapping[str, Setting]) -> dict[str, Any]:
+    """Values read from JSON as their settings have them; those of no setting as they are.
+
+    Raises:
+        ValueError: One line naming setting, value and what is allowed.
+    """
+    found = dict(given)
+    for name in found.keys() & known.keys():
+        one = known[name]
+        try:
+            found[name] = of_kind(given[name], float if one.traced else one.kind)
+        except ValueError as error:
+            raise ValueError(f"{name} {error}") from error
+    return found
 
 
 def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,7 +287,7 @@ def one_level(content: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in content.items():
         nested = isinstance(value, dict) and name in ("settings", "config", "hparams")
         flat_content |= value if nested else {name: value}
-    return ADDED | flat_content if of_a_method else flat_content
+    return ADDED | _UNSAID | flat_content if of_a_method else flat_content
 
 
 def refuse_contradictions(out: Any, held: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
@@ -221,9 +302,11 @@ def refuse_contradictions(out: Any, held: Mapping[str, Any], asked: Mapping[str,
         UserError: One line naming each that differs.
     """
     differing = [
-        f"{name} is {held.get(name)!r}, asked for {value!r}"
+        f"{name} is {shown(held[name])}, asked for {shown(value)}"
+        if name in held
+        else f"{CONFIG} lacks {name}, asked for {shown(value)}"
         for name, value in asked.items()
-        if name != "schema" and held.get(name) != value
+        if name != "schema" and (name not in held or held[name] != value)
     ]
     if differing:
         raise UserError(f"cannot resume {str(out)!r}: its {'; its '.join(differing)}")
@@ -234,15 +317,18 @@ def _of_schema_1(content: Mapping[str, Any]) -> dict[str, Any]:
 
     It held the settings of all methods and gates; those that are not this run's are left out.
     """
-    old = {**content["config"], **content["hparams"]}
-    found = {RENAMED.get(name, name): value for name, value in old.items()}
+    old = {**content.get("config", {}), **content.get("hparams", {})}
+    found = {str(RENAMED.get(name, name)): value for name, value in old.items()}
+    config = TrainConfig()
     for name, renamed in RENAMED_VALUES.items():
-        found[name] = renamed.get(found[name], found[name])
+        if isinstance(found.get(name), str):
+            found[name] = renamed.get(found[name], found[name])
+    of_their_kinds(found, catalogue(config, HParams()))
     spec = algorithms.method(content["algorithm"])
     hparams = HParams(
         method=spec.hparams(),
-        gate=gate(found["gate"]).hparams(),
-        predictor=predictor(found["predictor"]).hparams(),
+        gate=gate(found.get("gate", config.gate)).hparams(),
+        predictor=predictor(found.get("predictor", config.predictor)).hparams(),
     )
     mine = values(TrainConfig(method=spec.config()), hparams)
     return {name: value for name, value in found.items() if name in mine}

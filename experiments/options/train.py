@@ -10,12 +10,13 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
-from experiments.engine.run_folder import RunFolder
+from experiments.engine.fields import shown as show
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import (
     RunSettings,
     default_interval,
     flat,
+    read_run_settings,
     run_settings,
 )
 from experiments.options.hints import shown
@@ -149,10 +150,7 @@ def _before(argv: Sequence[str]) -> RunSettings | None:
         return None
     if out is None:
         raise UserError("--resume needs --out, the run folder to continue")
-    try:
-        return RunSettings.from_json(RunFolder(out).config())
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    return read_run_settings(Path(out))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +182,7 @@ def train_request(parsed: Any, defaults: dict[str, Any], argv: Sequence[str]) ->
     before = _before(argv)
     if before is not None:
         contradicting = [
-            f"{name} is {defaults[name]!r}, asked for {value!r}"
+            f"{name} is {show(defaults[name])}, asked for {show(value)}"
             for name, value in given.items()
             if name not in ("out", "resume")
         ]

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Mapping
 from typing import Any
+
+from experiments.engine.fields import read_fields
+from experiments.engine.runtime import UserError
+from ppl_jax.config import did_you_mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,24 +53,48 @@ class SessionConfig:
         """For config.json."""
         return {"session": dataclasses.asdict(self)}
 
-    @staticmethod
-    def from_json(content: Mapping[str, Any], rate: float) -> SessionConfig:
-        """The settings in a config.json.
 
-        Args:
-            content: Content of config.json. One without "session" is of version 0.1, which wrote
-                two of them at the top; the others had their defaults or were not kept.
-            rate: Where the file has none, steps per second.
-        """
-        if "session" not in content:
-            old = {name: content[name] for name in _OLD if name in content}
-            return SessionConfig(rate=rate, **old)
-        found = dict(content["session"])
-        asked = [one | {"choices": tuple(one["choices"])} for one in found.pop("questions")]
-        return SessionConfig(**found, questions=tuple(Question(**one) for one in asked))
+def read_session(content: Mapping[str, Any], rate: float, where: str) -> SessionConfig:
+    """The settings of a session in a config.json; what it lacks and has a default is that.
+
+    Args:
+        content: Content of config.json. One without "session" is of version 0.1, which wrote two of
+            them at the top; the others had their defaults or were not kept.
+        rate: Where the file has none, steps per second.
+        where: The file, for messages.
+
+    Raises:
+        UserError: One line naming file and field.
+    """
+    kinds = _KINDS | {"questions": list}
+    if "session" not in content:
+        return SessionConfig(rate=rate, **read_fields(content, _OLD, where))
+    where = f"{where}, session"
+    found = read_fields(content["session"], kinds, where)
+    if unknown := sorted(set(content["session"]) - set(kinds)):
+        raise UserError(f"{where}: unknown setting {unknown[0]!r}{did_you_mean(unknown[0], kinds)}")
+    found["questions"] = read_questions_in(found.get("questions", []), where)
+    found.setdefault("rate", rate)
+    return SessionConfig(**found)
 
 
-_OLD = ("participant", "manual_episodes")
+def read_questions_in(content: list[Any], where: str) -> tuple[Question, ...]:
+    """Questions from a JSON list of {"name", "text", and "choices" where it has any}.
+
+    Raises:
+        UserError: One line naming the question and its field.
+    """
+    kinds = {"name": str, "text": str, "choices": tuple[str | int | float, ...]}
+    questions = []
+    for i, one in enumerate(content, 1):
+        found = read_fields(one, kinds, f"{where}, question {i}", needed=("name", "text"))
+        found["choices"] = tuple(map(str, found.get("choices", ())))
+        questions.append(Question(**found))
+    return tuple(questions)
+
+
+_KINDS = typing.get_type_hints(SessionConfig)
+_OLD = {"participant": str, "manual_episodes": int}
 
 
 def participant_of(content: Mapping[str, Any]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shlex
 import sys
@@ -11,12 +10,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.fields import read_json, shown
 from experiments.engine.ownership import owned
 from experiments.engine.run import build_env, open_folder
 from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
-from experiments.engine.settings import RunSettings, check, one_level
-from experiments.ui.config import Question, SessionConfig
+from experiments.engine.settings import (
+    RunSettings,
+    check,
+    one_level,
+    read_config,
+    read_run_settings,
+    str_of_config,
+)
+from experiments.ui.config import Question, SessionConfig, read_questions_in, read_session
 from experiments.ui.views import display_of, make_view
 
 PARTICIPANT = re.compile(r"[A-Za-z0-9_-]{0,32}")
@@ -119,31 +126,23 @@ def resumed(out: Path, given: Mapping[str, Any]) -> tuple[RunSettings, SessionCo
     Raises:
         UserError: If there is no session, or with one line that names each contradiction.
     """
-    try:
-        content = RunFolder(out).config()
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    settings = RunSettings.from_json(content)
+    settings = read_run_settings(out)
     if settings.expert != "person":
         raise UserError(
             f"cannot resume {str(out)!r} with ppl play: its expert is {settings.expert!r}; use "
             "ppl train --resume"
         )
-    session_config = SessionConfig.from_json(content, display_of(settings.env).control_rate)
+    rate = display_of(settings.env).control_rate
+    session_config = read_session(read_config(out), rate, str_of_config(out))
     held = _held(settings.as_json()) | vars(session_config)
     wrong = [
-        f"{name} is {_short(held.get(name))}, asked for {_short(value)}"
+        f"{name} is {shown(held.get(name))}, asked for {shown(value)}"
         for name, value in given.items()
         if held.get(name) != value
     ]
     if wrong:
         raise UserError(f"cannot resume {str(out)!r}: its {'; its '.join(wrong)}")
     return settings, session_config
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _held(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,7 +173,7 @@ def read_consent(path: Path) -> str:
         UserError: If it cannot be read.
     """
     try:
-        text = path.read_text().strip()
+        text = path.read_text(encoding="utf-8-sig").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"consent: cannot read {str(path)!r} ({error})") from error
     if not 0 < len(text) <= LONGEST_TEXT:
@@ -188,22 +187,14 @@ def read_questions(path: Path) -> tuple[Question, ...]:
     Raises:
         UserError: If it cannot be read, or is no such list.
     """
-    try:
-        content = json.loads(path.read_text())
-        questions = tuple(
-            Question(
-                name=str(one["name"]),
-                text=str(one["text"]),
-                choices=tuple(map(str, one.get("choices", []))),
-            )
-            for one in content
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    content, where = read_json(path), f"questions {str(path)!r}"
+    if not isinstance(content, list) or not content:
         raise UserError(
-            f"questions: {str(path)!r} is no JSON list of objects with name, text and (if any) "
-            f"choices ({type(error).__name__}: {error})"
-        ) from error
+            f"{where} must hold a list of objects with name, text and (if any) choices, got "
+            f"{shown(content)}"
+        )
+    questions = read_questions_in(content, where)
     names = [question.name for question in questions]
-    if not questions or len(set(names)) != len(names) or max(map(len, names)) > 64:
-        raise UserError("questions: each needs a name of its own of at most 64 letters")
+    if len(set(names)) != len(names) or not 0 < min(map(len, names)) <= max(map(len, names)) <= 64:
+        raise UserError(f"{where}: each needs a name of its own of at most 64 letters")
     return questions

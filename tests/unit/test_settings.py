@@ -144,7 +144,7 @@ def test_a_config_of_a_newer_version_or_with_unknown_settings_is_refused():
     with pytest.raises(UserError, match="unknown setting 'beat': did you mean 'beta'"):
         RunSettings.from_json(content)
     del content["settings"]
-    with pytest.raises(UserError, match=r"config\.json cannot be read"):
+    with pytest.raises(UserError, match=r"config\.json lacks 'settings'"):
         RunSettings.from_json(content)
 
 
