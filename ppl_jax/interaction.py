@@ -350,8 +350,34 @@ def store(
     )
 
 
-def ingest(problem: Problem, learner: Learner, step: Interaction) -> Learner:
-    """Store a recorded step as if it were made now."""
+def ingest(
+    problem: Problem,
+    learner: Learner,
+    step: Interaction,
+    *,
+    ask_novice: bool = False,
+    state: PyTree | None = None,
+) -> Learner:
+    """Store a recorded step as if it were made now.
+
+    Args:
+        problem: See `Problem`.
+        learner: Before the step.
+        step: The step.
+        ask_novice: What the novice proposes while the expert acts was not recorded: the present
+            one is asked, as in `interact`.
+        state: The environment's before the step, where predictions were not recorded: they are
+            made from it.
+    """
+    novice_action = step.novice_action
+    if ask_novice:
+        proposed = propose(problem, learner, step.observation)
+        novice_action = jnp.where(step.takeover, proposed, novice_action)
+        step = dataclasses.replace(step, novice_action=novice_action)
+    if state is not None:
+        then = dataclasses.replace(learner, env_state=state, takeover=step.takeover)
+        predicted = look_ahead(problem, then, ahead_key(learner), novice_action)
+        step = dataclasses.replace(step, predicted=predicted)
     key = jax.random.split(learner.key, KEYS)[0]  # as `interact` would leave it
     return store(problem, dataclasses.replace(learner, key=key), step)
 

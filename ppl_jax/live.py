@@ -54,7 +54,9 @@ class LiveFunctions(NamedTuple):
         ingest: `ingest(learner, interactions [T], learning=True, first=0, count=None) -> (Learner,
             Metrics)`: use recorded steps, all from the first or `count` of them, as if they were
             made now, with an update after each where `learning`. With the settings and key of the
-            recorded session, its policy results again.
+            recorded session, its policy results again. With `ask_novice` the novice's actions in
+            steps of the expert are those of the learner; with `states` [T] the predictions are made
+            from these.
         algorithm: The method.
     """
 
@@ -161,13 +163,16 @@ def ingest_all(
     *,
     first: int | jax.Array = 0,
     count: int | jax.Array | None = None,
+    ask_novice: bool = False,
+    states: PyTree | None = None,
 ) -> tuple[Learner, Metrics]:
     """See `LiveFunctions.ingest`."""
     before = learner.counters
 
     def step(learner: Learner) -> tuple[Learner, Metrics]:
         at = first + learner.counters.steps - before.steps
-        learner = ingest(problem, learner, jax.tree.map(lambda column: column[at], interactions))
+        row, state = jax.tree.map(lambda column: column[at], (interactions, states))
+        learner = ingest(problem, learner, row, ask_novice=ask_novice, state=state)
         return learn(learner, problem.algorithm.update) if learning else (learner, {})
 
     if count is None:

@@ -14,11 +14,12 @@ import numpy as np
 
 from envs import pretrained
 from envs.registry import make
+from experiments.engine.config_file import config_path, read_config
 from experiments.engine.fields import read_fields
 from experiments.engine.policy_file import load_meta, load_policy
 from experiments.engine.run_folder import EVALUATION, POLICY
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import read_config, read_run_settings, str_of_config
+from experiments.engine.settings import read_run_settings
 from ppl_jax import experts
 from ppl_jax.config import HParams, as_arrays, env_params
 from ppl_jax.evaluation import Episodes, make_evaluate
@@ -168,7 +169,7 @@ def run_options(run: Path) -> tuple[str, dict[str, Any]]:
             raise UserError(f"policy file {str(run)!r} cannot be read: its meta names no env")
         return meta["env"], {}
     config = read_config(run)
-    read_fields(config, {}, str_of_config(run), needed=("env",))
+    read_fields(config, {}, config_path(run), needed=("env",))
     names = ("scenarios", "held_out_scenarios")
     options = {name: value for name in names if (value := config.get(name)) is not None}
     return config["env"], {"physics": run_physics(config), **options}

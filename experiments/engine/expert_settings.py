@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from envs.registry import check_physics, known, unknown
+from experiments.engine.config_file import KINDS, checked_content, config_path, read_config
 from experiments.engine.fields import read_fields
 from experiments.engine.run_folder import CONFIG, RunFolder
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import (
-    MAX_SEED,
-    SCHEMA,
-    checked_content,
-    of_their_kinds,
-    read_config,
-    schema_of,
-    str_of_config,
-)
+from experiments.engine.settings import MAX_SEED, SCHEMA, of_their_kinds, schema_of
 from ppl_jax.cards import card
 from ppl_jax.ppo.config import OLD_NAMES, PPOConfig, PPOHParams, catalogue, read, replace, validate
 
@@ -92,7 +84,7 @@ PLAIN = tuple(
     if field.name not in ("config", "hparams")
 )
 """The fields of `ExpertSettings` beside the settings of PPO-Lagrangian."""
-_KINDS = {name: typing.get_type_hints(ExpertSettings)[name] for name in PLAIN}
+_KINDS = {name: KINDS[name] for name in PLAIN}
 
 
 def read_settings(folder: RunFolder) -> ExpertSettings:
@@ -107,7 +99,7 @@ def read_settings(folder: RunFolder) -> ExpertSettings:
             f"{str(folder.path)!r} is a run of {content.get('algorithm')}, not of "
             "`ppl expert train`"
         )
-    return ExpertSettings.from_json(content, str_of_config(folder.path))
+    return ExpertSettings.from_json(content, config_path(folder.path))
 
 
 def flat(config: PPOConfig, hparams: PPOHParams) -> dict[str, Any]:

@@ -9,7 +9,6 @@ a policy that has one), `version` of this format, and `meta`, a JSON string.
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from experiments.engine.files import write_atomic
 from ppl_jax.experts import SavedPolicy
+from ppl_jax.npz import read_npz
 
 VERSION = 1
 
@@ -47,19 +47,18 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
             finite, its layers do not fit together, or its sizes are not the environment's.
     """
     name = f"policy file {str(path)!r}"
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            files = {name: archive[name] for name in archive.files}
-        count = sum(name[0] == "w" and name[1:].isdigit() for name in files)
-        weights = [(files[f"w{i}"], files[f"b{i}"]) for i in range(count)]
-        activation, output = str(files["activation"]), str(files["output"])
-        version = int(files.get("version", VERSION))
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{name} cannot be read: {error}") from error
-    if version > VERSION:
+    files = _read(path)
+    if (version := _version(files, name)) > VERSION:
         raise ValueError(f"{name} has version {version}; this program reads up to {VERSION}")
-    if not weights:
+    count = sum(field[0] == "w" and field[1:].isdigit() for field in files)
+    if not count:
         raise ValueError(f"{name} holds no layer w0, b0")
+    layers = [(f"w{i}", f"b{i}") for i in range(count)]
+    for field in (*(field for layer in layers for field in layer), "activation", "output"):
+        if field not in files:
+            raise ValueError(f"{name} holds no array {field!r}")
+    weights = [(files[w], files[b]) for w, b in layers]
+    activation, output = str(files["activation"]), str(files["output"])
     if activation not in ("relu", "tanh") or output not in ("tanh", "clip"):
         raise ValueError(
             f"{name}: activation must be relu or tanh and output tanh or clip, got "
@@ -69,7 +68,7 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     scale = files.get("obs_scale", np.ones(observation_size, np.float32))
     log_std = files.get("log_std")
     for i, (w, b) in enumerate(weights):
-        fits = w.ndim == 2 and b.shape == w.shape[1:]
+        fits = w.ndim == 2 and b.shape == w.shape[1:] and w.size
         if not fits or (i and weights[i - 1][0].shape[1] != w.shape[0]):
             raise ValueError(
                 f"{name}: w{i} {w.shape} and b{i} {b.shape} do not fit the layer before"
@@ -92,10 +91,13 @@ def load_policy(path: str | Path, observation_size: int, action_size: int) -> Sa
     for field, value in arrays.items():
         if value.shape != shapes.get(field, value.shape):
             raise ValueError(f"{name}: {field} has shape {value.shape}, expected {shapes[field]}")
-        if value.dtype.kind != "f":
+        if value.dtype.kind not in "iuf":
             raise ValueError(f"{name}: {field} holds {value.dtype}, expected real numbers")
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name}: {field} holds a NaN or infinite number")
+        with np.errstate(over="ignore"):
+            bad = ~np.isfinite(value.astype(np.float32))
+        if bad.any():
+            at = [int(i) for i in np.argwhere(bad)[0]]
+            raise ValueError(f"{name}: {field} holds a NaN or infinite number at {at}")
     if not (scale > 0).all():
         raise ValueError(f"{name}: obs_scale must be positive")
     return SavedPolicy(
@@ -112,10 +114,33 @@ def load_meta(path: str | Path) -> dict[str, Any]:
     """Facts that a policy file holds about itself.
 
     Raises:
-        ValueError: If it cannot be read.
+        ValueError: If it cannot be read, or they are no JSON object.
     """
+    files = _read(path)
+    if "meta" not in files:
+        raise ValueError(f"policy file {str(path)!r} holds no array 'meta'")
+    text = str(files["meta"])
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return json.loads(str(archive["meta"]))
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        meta = json.loads(text)
+    except (ValueError, RecursionError):
+        meta = None
+    if not isinstance(meta, dict):
+        raise ValueError(
+            f"policy file {str(path)!r}: meta must be a JSON object, got {text[:40]!r}"
+        )
+    return meta
+
+
+def _read(path: str | Path) -> dict[str, np.ndarray]:
+    try:
+        return read_npz(path)
+    except ValueError as error:
         raise ValueError(f"policy file {str(path)!r} cannot be read: {error}") from error
+
+
+def _version(files: dict[str, np.ndarray], name: str) -> int:
+    """The version of the format; the first wrote none."""
+    version = files.get("version", np.array(VERSION))
+    if version.shape != () or version.dtype.kind not in "iu":
+        raise ValueError(f"{name}: version must be a whole number, got {str(version)[:40]!r}")
+    return int(version)

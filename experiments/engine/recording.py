@@ -12,32 +12,48 @@ exported session is one file of the same columns. All are [T] or [T, ...]:
     episode                           a number for each, an unfinished one too
     ahead, fails                      the predicted path that was shown, [T, H, P], and its verdict
     state/...                         the environment's before the step, enough to draw it
+
+Demonstrations from elsewhere need `observation`, `executed_action` (or `action`) and one of
+`episode`, `terminated` and `truncated`; `experiments.engine.columns` says what each column may hold
+and what follows from the others where it is missing. Columns of other names are left out. `meta` is
+a JSON object, the session's config.json; its `env`, where it is there, has to be the run's.
 """
 
 from __future__ import annotations
 
 import json
 import warnings
-import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from experiments.engine.columns import (
+    AHEAD,
+    EPISODE,
+    FAILS,
+    META,
+    PREDICTED,
+    STATE,
+    Columns,
+    checked,
+    completed,
+    joined,
+)
+from experiments.engine.config_file import checked_content, read_config
 from experiments.engine.files import write_atomic
-from experiments.engine.run_folder import RunFolder
 from experiments.engine.runtime import UserError, need
+from ppl_jax.interaction import no_prediction
+from ppl_jax.npz import read_npz
 from ppl_jax.types import Env, Interaction, Trajectory
 
 FOLDER = "recording"
-STATE, PREDICTED, EPISODE, META = "state/", "predicted/", "episode", "meta"
-AHEAD, FAILS = "ahead", "fails"
 _RENAMED = {"takeover": "is_intervention"}
 _STEP_FIELDS = (
     "observation",
     "next_observation",
-    "novice_action",
     "expert_action",
     "executed_action",
     "takeover_start",
@@ -48,8 +64,6 @@ _STEP_FIELDS = (
     "success",
 )
 _PREDICTED_FIELDS = ("observation", "reward", "speed", "unsafe", "success", "terminated", "valid")
-
-Columns = dict[str, np.ndarray]
 
 
 class PredictedPath(NamedTuple):
@@ -130,35 +144,38 @@ def load(path: Path) -> tuple[Columns, dict[str, Any]]:
     """The columns of a run folder or an exported session, and the content of its config.json.
 
     Raises:
-        UserError: If there is no recording, or it cannot be read.
+        UserError: If there is no recording, or one line of what in it cannot be.
     """
+    where = f"recording {str(path)!r}"
     if path.is_dir():
-        try:
-            config = RunFolder(path).config()
-        except ValueError as error:
-            raise UserError(str(error)) from error
-        found = [_columns(piece) for piece in _pieces(path / FOLDER)]
+        config = read_config(path)
+        found = {}
+        for piece in _pieces(path / FOLDER):
+            name = f"recording {str(piece)!r}"
+            found[name] = checked(_read(piece, name), name)
         if not found:
             raise UserError(f"{str(path)!r} has no recording: no step of a person was saved in it")
-        columns = {name: np.concatenate([piece[name] for piece in found]) for name in found[0]}
-        return columns, config
-    columns = _columns(path)
-    try:
-        config = json.loads(str(columns.pop(META)))
-    except (KeyError, ValueError) as error:
-        raise UserError(f"recording {str(path)!r} has no readable {META}") from error
-    return columns, config
+        return completed(joined(found), where), config
+    columns = _read(path, where)
+    config = _meta(columns.pop(META, np.array("{}")), f"{where}, {META}")
+    return completed(checked(columns, where), where), config
 
 
-def _columns(path: Path) -> Columns:
+def _read(path: Path, where: str) -> Columns:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            columns = {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"recording {str(path)!r} cannot be read: {reason}") from error
+        columns = read_npz(path)
+    except ValueError as error:
+        raise UserError(f"{where} cannot be read: {error}") from error
     columns.pop("next_episode", None)
     return columns
+
+
+def _meta(array: np.ndarray, where: str) -> dict[str, Any]:
+    try:
+        content = json.loads(str(array))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where} must be a JSON object, got {str(array)[:40]!r}") from error
+    return checked_content(content, where)
 
 
 def export(run: Path, out: Path) -> int:
@@ -174,69 +191,73 @@ def export(run: Path, out: Path) -> int:
     return len(columns[EPISODE])
 
 
-def interactions(columns: Columns, env: Env, horizon: int) -> Interaction:
+def predicted_steps(columns: Columns) -> int:
+    """Number of predicted states per step that can be learnt from, L; 0 where there are none.
+
+    They belong to the novice's action.
+    """
+    needed = ["novice_action", *(PREDICTED + name for name in _PREDICTED_FIELDS)]
+    return columns[needed[1]].shape[1] if all(name in columns for name in needed) else 0
+
+
+def interactions(columns: Columns, env: Env, horizon: int, where: str = "recording") -> Interaction:
     """Recorded steps as passed to a method, [T].
 
     Args:
-        columns: From `load`.
+        columns: From `load`. Where they have no novice's action, it is the executed one.
         env: The environment they are learnt in.
-        horizon: Predicted states that the method needs per step (`max_preference_horizon`).
+        horizon: Predicted states per step.
+        where: File, for messages.
 
     Raises:
         UserError: If they are of another environment, or hold fewer predicted states.
     """
-    _check_columns(columns, env)
-    kept = columns.get(PREDICTED + "observation")
-    have = 0 if kept is None else kept.shape[1]
-    if have < horizon:
-        raise UserError(
-            f"max_preference_horizon must not exceed the recording's predicted states ({have}), "
-            f"got {horizon}"
-        )
-
-    def column(name: str) -> Any:
-        if name not in columns:
-            raise UserError(f"the recording has no column {name!r}")
-        return columns[name]
-
-    predicted = {name: column(PREDICTED + name)[:, :horizon] for name in _PREDICTED_FIELDS}
-    return Interaction(
-        takeover=column("is_intervention"),
-        predicted=Trajectory(**predicted),
-        **{name: column(name) for name in _STEP_FIELDS},
-    )
-
-
-def _check_columns(columns: Columns, env: Env) -> None:
     for name, size in (
         ("observation", env.spec.observation_size),
         ("executed_action", env.spec.action_size),
     ):
-        if name not in columns:
-            raise UserError(f"the recording has no column {name!r}")
-        shape = columns[name].shape
-        if len(shape) != 2 or shape[1] != size:
-            raise UserError(f"the recording's {name} is {shape}, {env.name} needs [T, {size}]")
-    for name, column in columns.items():
-        if np.issubdtype(column.dtype, np.floating) and not name.startswith(STATE):
-            bad = ~np.isfinite(column)
-            if bad.any():
-                raise UserError(f"the recording's {name} is not finite in {bad.sum()} places")
+        shape = list(columns[name].shape)
+        if shape[1] != size:
+            raise UserError(f"{where}: column {name!r} is {shape}, {env.name} needs [T, {size}]")
+    have = predicted_steps(columns)
+    if have < horizon:
+        raise UserError(f"{where} has {have} predicted states of each step, not {horizon}")
+    column = cast(dict[str, Any], columns)
+    length, predicted = len(column[EPISODE]), no_prediction()
+    if horizon:
+        found = {name: column[PREDICTED + name][:, :horizon] for name in _PREDICTED_FIELDS}
+        predicted = Trajectory(**found)
+    else:
+        predicted = jax.tree.map(
+            lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), predicted
+        )
+    return Interaction(
+        takeover=column["is_intervention"],
+        novice_action=column.get("novice_action", column["executed_action"]),
+        predicted=predicted,
+        **{name: column[name] for name in _STEP_FIELDS},
+    )
 
 
 def states(columns: Columns, like: Any) -> Any:
     """The recorded states, [T], as a struct like `like`.
 
     Raises:
-        UserError: If they are of another environment.
+        UserError: With the column that is missing or of another environment, after "recording X: ".
     """
-    names = list(_flat(like))
-    missing = [name for name in names if STATE + name not in columns]
-    if missing:
-        raise UserError(
-            f"the recording's states are of another environment: they lack {missing[0]!r}"
-        )
-    return jax.tree.unflatten(jax.tree.structure(like), [columns[STATE + name] for name in names])
+    leaves = _flat(like)
+    for name, leaf in leaves.items():
+        if STATE + name not in columns:
+            raise UserError(f"it has no column {STATE + name!r}")
+        column = columns[STATE + name]
+        fits = np.can_cast(column.dtype, leaf.dtype, "same_kind")
+        if column.shape[1:] != leaf.shape or not fits:
+            raise UserError(
+                f"its column {STATE + name!r} has rows of {list(column.shape[1:])} {column.dtype}, "
+                f"not of {list(leaf.shape)} {leaf.dtype}"
+            )
+    found = [columns[STATE + name].astype(leaf.dtype) for name, leaf in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(like), found)
 
 
 def export_minari(run: Path, name: str) -> int:
@@ -280,6 +301,7 @@ def _episode_buffers(columns: Columns) -> list[Any]:
         infos = {
             key: columns[key][at]
             for key in ("is_intervention", "novice_action", "expert_action", "cost", "success")
+            if key in columns
         }
         last = columns["next_observation"][at][-1:]
         found.append(

@@ -16,6 +16,7 @@ import flax.struct
 import jax
 import numpy as np
 
+from experiments.engine.config_file import config_path, read_config
 from experiments.engine.evaluate import (
     arrays_of,
     make_env,
@@ -39,10 +40,8 @@ from experiments.engine.settings import (
     RunSettings,
     check,
     one_level,
-    read_config,
     refuse_contradictions,
     schema_of,
-    str_of_config,
 )
 from ppl_jax import algorithms, checkpoint, experts
 from ppl_jax.cards import card
@@ -186,7 +185,7 @@ def open_folder(folder: RunFolder, content: dict[str, Any], resume: bool) -> Non
     """
     if resume:
         before = read_config(folder.path)
-        read_fields(before, {}, str_of_config(folder.path), needed=("env", "algorithm", "seed"))
+        read_fields(before, {}, config_path(folder.path), needed=("env", "algorithm", "seed"))
         held = one_level(before)
         asked = one_level(json.loads(json.dumps(content)))
         refuse_contradictions(folder.path, held, asked)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from envs.registry import check_physics, known, unknown
+from experiments.engine.config_file import KINDS, checked_content, config_path, read_config
 from experiments.engine.fields import of_kind, read_fields, shown
-from experiments.engine.run_folder import CONFIG, RunFolder
+from experiments.engine.run_folder import CONFIG
 from experiments.engine.runtime import UserError
 from ppl_jax import algorithms
 from ppl_jax.cards import card
@@ -113,10 +113,8 @@ class RunSettings:
         """
         schema = schema_of(checked_content(content, where), where)
         parts = ("config", "hparams") if schema == 1 else ("settings",)
-        kinds = dict.fromkeys(parts, dict) | _KINDS
         content = as_it_was(content)
-        given = read_fields(content, kinds, where, needed=(*_NEEDED, *parts))
-        given = {name: value for name, value in given.items() if name in _PLAIN}
+        given = read_fields(content, _KINDS, where, needed=(*_NEEDED, *parts))
         try:
             found = _of_schema_1(content) if schema == 1 else dict(content["settings"])
             config, hparams = with_values(given["env"], given["algorithm"], found)
@@ -131,9 +129,8 @@ _PLAIN = tuple(
     for field in dataclasses.fields(RunSettings)
     if field.name not in ("config", "hparams")
 )
-_KINDS = {name: typing.get_type_hints(RunSettings)[name] for name in _PLAIN}
+_KINDS = {name: KINDS[name] for name in _PLAIN}
 _NEEDED = ("env", "algorithm", "seed")
-_PARTS = dict.fromkeys(("settings", "config", "hparams", "session"), dict)
 # beside the settings: what a run is that says nothing of them
 _UNSAID = {
     field.name: field.default
@@ -142,40 +139,9 @@ _UNSAID = {
 }
 
 
-def checked_content(content: Any, where: str) -> dict[str, Any]:
-    """The content of a config.json of any kind of run, of any version, as it is.
-
-    Raises:
-        UserError: One line naming file and field, if it is no object or a field is of another kind.
-    """
-    read_fields(content, {**_KINDS, **_PARTS, "schema": int}, where)
-    switches = {"physics": str, "randomise": bool}
-    for part in (content, content.get("settings", {})):
-        read_fields(part, switches, where)
-    return content
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """The content of config.json of a run folder, of any kind and version.
-
-    Raises:
-        UserError: One line, if it is no run folder or a field is of another kind.
-    """
-    try:
-        content = RunFolder(path).config()
-    except (ValueError, RecursionError) as error:
-        raise UserError(str(error)) from error
-    return checked_content(content, str_of_config(path))
-
-
 def read_run_settings(path: Path) -> RunSettings:
     """The settings of the run in a folder (see `RunSettings.from_json`)."""
-    return RunSettings.from_json(read_config(path), str_of_config(path))
-
-
-def str_of_config(path: Path) -> str:
-    """A run folder's config.json as messages name it."""
-    return repr(str(path / CONFIG))
+    return RunSettings.from_json(read_config(path), config_path(path))
 
 
 def program_key(settings: RunSettings) -> tuple[str, ...]:
@@ -366,7 +332,7 @@ def run_settings(
     Raises:
         UserError: One line naming field, value and what is allowed.
     """
-    from experiments.engine.recorded import length_of, recording_of
+    from experiments.engine.recorded import default_lengths, recording_of
 
     if not known(env):
         raise UserError(unknown(env))
@@ -376,8 +342,7 @@ def run_settings(
         if expert == "recorded":
             raise UserError("expert recorded needs the session: --expert recorded PATH")
         if (path := recording_of(expert)) is not None:
-            whole = length_of(path, env) // config.decision_interval
-            given.setdefault("total_steps", whole * config.decision_interval)
+            given = default_lengths(path, env, algorithm, config, given) | given
         if "total_steps" in given and "demonstrations" not in given:
             given["demonstrations"] = min(config.demonstrations, max(given["total_steps"], 0))
             if not given["demonstrations"]:

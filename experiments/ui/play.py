@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.config_file import config_path, read_config
 from experiments.engine.fields import read_json, shown
 from experiments.engine.ownership import owned
 from experiments.engine.run import build_env, open_folder
@@ -19,9 +20,7 @@ from experiments.engine.settings import (
     RunSettings,
     check,
     one_level,
-    read_config,
     read_run_settings,
-    str_of_config,
 )
 from experiments.ui.config import Question, SessionConfig, read_questions_in, read_session
 from experiments.ui.views import display_of, make_view
@@ -133,7 +132,7 @@ def resumed(out: Path, given: Mapping[str, Any]) -> tuple[RunSettings, SessionCo
             "ppl train --resume"
         )
     rate = display_of(settings.env).control_rate
-    session_config = read_session(read_config(out), rate, str_of_config(out))
+    session_config = read_session(read_config(out), rate, config_path(out))
     held = _held(settings.as_json()) | vars(session_config)
     wrong = [
         f"{name} is {shown(held.get(name))}, asked for {shown(value)}"

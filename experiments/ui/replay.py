@@ -71,7 +71,7 @@ class Replay:
         return {
             "kind": "about",
             "env": self.config["env"],
-            "algorithm": self.config["algorithm"],
+            "algorithm": self.config.get("algorithm", ""),
             "rate": self.rate,
             "total": self.length,
             "actions": self.columns["executed_action"].shape[1],
@@ -169,6 +169,12 @@ def replay(path: Path, host: str, port: int, exposed: bool = False) -> None:
     """
     server = web()
     columns, config = recording.load(path)
+    for column in (recording.AHEAD, recording.FAILS):
+        if column not in columns:
+            raise UserError(
+                f"recording {str(path)!r} cannot be shown: it has no column {column!r}, which ppl "
+                "play writes"
+            )
     name = str(config.get("env"))
     try:
         rate = display_of(name).control_rate
@@ -180,5 +186,9 @@ def replay(path: Path, host: str, port: int, exposed: bool = False) -> None:
     with server.listen(host, port, exposed) as served:
         hub = server.Hub(env.spec.action_size)
         view = make_view(env, hub.picture)
-        shown = Replay(env, columns, config, view=view, publish=hub.publish, rate=rate)
+        try:
+            shown = Replay(env, columns, config, view=view, publish=hub.publish, rate=rate)
+        except UserError as error:
+            view.close()
+            raise UserError(f"recording {str(path)!r} cannot be shown: {error}") from error
         server.serve(hub, shown, served, exposed=exposed)

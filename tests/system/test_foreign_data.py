@@ -1,14 +1,20 @@
 """Files of others: what can be taken is taken, the rest is one line and exit code 2."""
 
+import io
 import json
+import re
 
+import numpy as np
 import pytest
 
 import envs
 from experiments.cli import main
+from experiments.engine import recording
+from experiments.engine.config_file import read_config
 from experiments.engine.expert_settings import ExpertSettings, settings_for
+from experiments.engine.policy_file import load_policy
 from experiments.engine.runtime import UserError
-from experiments.engine.settings import RunSettings, read_config, run_settings
+from experiments.engine.settings import RunSettings, run_settings
 from experiments.ui.play import read_questions, resumed
 from tests.helpers import Probe
 
@@ -171,3 +177,354 @@ def test_questions_of_another_form_are_refused(text, said, tmp_path):
         read_questions(file)
     assert said in str(refusal.value)
     assert str(file) in str(refusal.value)
+
+
+# recordings
+
+STEPS, AHEAD = 60, 4
+
+
+def demonstrations(steps=STEPS):
+    """The probe's expert in episodes of 20 steps, as plain arrays with the world's states."""
+    sign = np.where(np.arange(steps) // 20 % 2, -1.0, 1.0)
+    zero = np.zeros(steps)
+    return {
+        "observation": np.stack([sign, zero, zero + 1], 1),
+        "action": Probe.answer(sign)[:, None],
+        "episode": np.arange(steps) // 20,
+        "state/sign": sign.astype(np.float32),
+        "state/error": zero.astype(np.float32),
+        "state/time": (np.arange(steps) % 20).astype(np.int32),
+    }
+
+
+def plain():
+    """The same without the states."""
+    return {k: v for k, v in demonstrations().items() if not k.startswith("state/")}
+
+
+def whole():
+    """A recording with every column, as other tools might write them."""
+    flags, zero = np.zeros(STEPS), np.zeros(STEPS)
+    columns = plain() | {"expert_action": plain()["action"], "novice_action": zero[:, None]}
+    columns |= dict.fromkeys(("takeover_start", "truncated", "success"), flags)
+    columns |= {"is_intervention": flags + 1, "reward": zero, "cost": zero}
+    columns |= {"terminated": np.tile(np.arange(20) == 19, 3), "next_observation": plain()[OBS]}
+    columns |= {"predicted/observation": np.zeros((STEPS, AHEAD, 3))}
+    for name in ("reward", "speed", "unsafe", "success", "terminated", "valid"):
+        columns["predicted/" + name] = np.zeros((STEPS, AHEAD))
+    return columns
+
+
+OBS = "observation"
+
+
+def saved(path, columns):
+    np.savez(path, **columns)
+    return path
+
+
+def at(array, row, value):
+    """A copy of an array with one value changed."""
+    array = np.array(array, float)
+    array[row] = value
+    return array
+
+
+def no(name):
+    return {k: v for k, v in plain().items() if k != name}
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (no(OBS), " has no column 'observation'"),
+        (no("action"), " has no column 'executed_action'"),
+        (no("episode"), " does not say where episodes end: it has no episode, terminated, trunc"),
+        (plain() | {"executed_action": np.zeros((60, 1))}, " has both columns 'action'"),
+        (plain() | {OBS: np.zeros((0, 3))}, ": column 'observation' has no rows"),
+        (
+            plain() | {"reward": np.float32(0)},
+            ": column 'reward' must have a row per step (60), go",
+        ),
+        (
+            plain() | {"terminated": np.zeros(50)},
+            ": column 'terminated' has 50 rows, 'observation' has 60",
+        ),
+        (
+            plain() | {"action": np.zeros((60, 2, 2))},
+            ": column 'executed_action' must be [T, A], g",
+        ),
+        (
+            plain() | {"expert_action": np.zeros((60, 2))},
+            ": column 'expert_action' must be [T, A] with A = 1 as in the columns before, got",
+        ),
+        (
+            plain() | {"action": at(plain()["action"], (12, 0), -3)},
+            ": column 'executed_action', row 12, index 0: must be in [-1, 1], got -3.0",
+        ),
+        (
+            plain() | {OBS: at(plain()[OBS], (7, 2), np.nan)},
+            ": column 'observation', row 7, index 2: must be a finite number, got nan",
+        ),
+        (
+            plain() | {"reward": at(np.zeros(60), 3, 1e300)},
+            ": column 'reward', row 3: must be a finite number, got 1e+300",
+        ),
+        (
+            plain() | {"cost": at(np.zeros(60), 3, -1)},
+            ": column 'cost', row 3: must be a finite number of 0 or more, got -1.0",
+        ),
+        (
+            plain() | {"success": at(np.zeros(60), 5, 0.5)},
+            ": column 'success', row 5: must be true or false, or 0 or 1, got 0.5",
+        ),
+        (
+            plain() | {"success": np.array(["no"] * 60)},
+            ": column 'success' must hold true or false, or 0 or 1, got <U2",
+        ),
+        (
+            plain() | {"episode": np.arange(60) / 2},
+            ": column 'episode', row 1: must be a whole number of 0 or more, got 0.5",
+        ),
+        (
+            plain() | {"episode": np.arange(60) // 20 % 2},
+            ": column 'episode', row 40: must be a number of its own, got 0 again",
+        ),
+        (
+            plain() | {"terminated": np.arange(60) == 3},
+            ": column 'terminated', row 3: must be 0 where episode 0 goes on in the next row",
+        ),
+        (
+            plain() | {"is_interventon": np.zeros(60)},
+            " has an unknown column 'is_interventon': did you mean 'is_intervention'?",
+        ),
+        (plain() | {"state/sign": np.array(["a"] * 60)}, ": column 'state/sign' must hold numbers"),
+        (plain() | {"meta": np.str_("[1]")}, ", meta must hold an object, got [1]"),
+        (plain() | {"meta": np.str_("{")}, ", meta must be a JSON object, got '{'"),
+        (plain() | {"meta": np.str_('{"env": 3}')}, ", meta: env must be text, got 3"),
+        (
+            plain() | {"reward": np.array([None] * 60)},
+            " cannot be read: array 'reward' holds P",
+        ),
+        (
+            whole() | {"predicted/unsafe": np.zeros((60, 3))},
+            ": column 'predicted/unsafe' must be [T, L] with L = 4 as in the columns before, got",
+        ),
+        (
+            whole() | {"predicted/valid": at(np.zeros((60, 4)), (9, 2), 2)},
+            ": column 'predicted/valid', row 9, index 2: must be true or false, or 0 or 1, got 2.0",
+        ),
+    ],
+)
+def test_a_recording_that_cannot_be_right_is_told_to_the_row(columns, said, tmp_path):
+    path = tmp_path / "x.npz"
+    np.savez(path, allow_pickle=True, **columns)
+    with pytest.raises(UserError) as refusal:
+        recording.load(path)
+    assert str(refusal.value).startswith(f"recording '{path}'{said}")
+    assert "\n" not in str(refusal.value)
+    assert "pickle" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda path: path.write_bytes(b""), "it is empty"),
+        (lambda path: path.write_bytes(b"no zip"), "it is no .npz archive"),
+        (lambda path: path.write_bytes(bytes_of(np.save, np.zeros(3))), "but a single .npy array"),
+        (lambda path: None, "No such file"),
+        (lambda path: path.write_bytes(TORN), "was cut off"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["recording", "policy"])
+def test_a_file_that_is_no_archive_is_told(write, said, kind, tmp_path):
+    path = tmp_path / "x.npz"
+    write(path)
+    with pytest.raises((UserError, ValueError)) as refusal:
+        recording.load(path) if kind == "recording" else load_policy(path, 3, 1)
+    assert str(path) in str(refusal.value)
+    assert said in str(refusal.value)
+
+
+def bytes_of(save, *arrays):
+    file = io.BytesIO()
+    save(file, *arrays)
+    return file.getvalue()
+
+
+TORN = bytes_of(np.savez, np.zeros(300))[:800]
+
+
+def test_other_kinds_of_the_same_numbers_are_taken(tmp_path):
+    columns, config = recording.load(saved(tmp_path / "x.npz", whole()))
+    assert config == {}
+    for name in ("is_intervention", "success", "predicted/valid", "terminated"):
+        assert columns[name].dtype == bool
+    assert columns["is_intervention"].all()
+    np.testing.assert_array_equal(columns["executed_action"], whole()["action"])
+    changed = whole() | {OBS: np.ones((60, 3), int), "reward": np.zeros((60, 1))}
+    changed |= {
+        "action": whole()["action"][:, 0],
+        "notes": np.zeros(3),
+        "episode": np.repeat(1.0, 60),
+    }
+    changed |= {"terminated": np.zeros(60, np.uint8)}
+    columns, _ = recording.load(saved(tmp_path / "y.npz", changed))
+    assert columns[OBS].dtype == np.float32
+    assert columns["reward"].shape == (60,)
+    assert columns["executed_action"].shape == (60, 1)
+    assert "notes" not in columns  # of a name that is not near any of ours
+
+
+def test_what_follows_from_observations_actions_and_ends(tmp_path):
+    given = plain() | {OBS: np.arange(180.0).reshape(60, 3)}
+    columns, _ = recording.load(saved(tmp_path / "x.npz", given))
+    for t in range(60):
+        ends = t % 20 == 19
+        after = given[OBS][t if ends else t + 1]
+        np.testing.assert_array_equal(columns["next_observation"][t], after)
+        assert columns["terminated"][t] == ends
+        assert columns["takeover_start"][t] == (t % 20 == 0)
+    assert not columns["truncated"].any()
+    assert columns["is_intervention"].all()
+    assert "novice_action" not in columns
+    del given["episode"]
+    given["truncated"] = columns["terminated"]
+    flagged, _ = recording.load(saved(tmp_path / "y.npz", given))
+    np.testing.assert_array_equal(flagged["episode"], columns["episode"])
+    assert not flagged["terminated"].any()
+
+
+def test_pieces_of_a_session_have_the_same_columns(tmp_path):
+    run = run_folder(tmp_path / "run", config(env="probe"))
+    (run / "recording").mkdir()
+    first, second = (run / f"recording/{number:010d}.npz" for number in (60, 120))
+    saved(first, plain())
+    saved(second, plain() | {"episode": plain()["episode"] + 3})
+    columns, _ = recording.load(run)
+    assert len(columns[OBS]) == 120
+    saved(second, whole())
+    with pytest.raises(UserError, match=rf"'{first}' has no column '.*', which .*'{second}' has"):
+        recording.load(run)
+    saved(second, plain() | {"episode": plain()["episode"] + 3, OBS: np.zeros((60, 2))})
+    with pytest.raises(UserError, match=r"'observation' has rows of \[2\], those of .* \[3\]"):
+        recording.load(run)
+
+
+def test_a_recording_of_another_world_is_one_line(tmp_path, capsys):
+    train = ["train", "probe", "--out", tmp_path / "run", "--expert", "recorded"]
+    named = plain() | {"meta": np.str_(json.dumps({"env": "driving"}))}
+    path = saved(tmp_path / "x.npz", named)
+    assert refused(capsys, *train, path) == f"recording '{path}' is of driving, not of probe"
+    saved(path, plain() | {OBS: np.zeros((60, 2))})
+    said = f"recording '{path}': column 'observation' is [60, 2], probe needs [T, 3]"
+    assert refused(capsys, *train, path, "--algorithm", "bc") == said
+    saved(path, {k: v[:7] for k, v in plain().items()})
+    said = f"recording '{path}' must have at least decision_interval (10) steps, got 7"
+    assert refused(capsys, *train, path) == said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, r"there are none, nor can they be predicted here \(it has no column 'state/sign'\)"),
+        (
+            demonstrations() | {"state/time": np.zeros((60, 2), np.int32)},
+            r"\(its column 'state/time' has rows of \[2\] int32, not of \[\] int32\)",
+        ),
+    ],
+)
+def test_a_method_that_needs_predictions_says_what_is_missing(change, said, tmp_path, capsys):
+    path = saved(tmp_path / "x.npz", plain() | {k: change[k] for k in change if "state" in k})
+    told = refused(
+        capsys, "train", "probe", "--out", tmp_path / "run", "--expert", "recorded", path
+    )
+    assert re.search(f"ppl needs 10 predicted states of each step, .*{said}", told)
+    assert "give a method that needs none (bc, gail, hg_dagger, " in told
+    saved(path, whole())
+    told = refused(
+        capsys, "train", "probe", "--out", tmp_path / "run", "--expert", "recorded", path
+    )
+    assert "there are 4, nor" in told
+    assert "give --max-preference-horizon 4, or a method that needs none" in told
+
+
+def test_states_of_another_scenario_are_not_predicted_from(tmp_path, capsys):
+    other = demonstrations() | {"state/sign": -demonstrations()["state/sign"]}
+    path = saved(tmp_path / "x.npz", other)
+    told = refused(
+        capsys, "train", "probe", "--out", tmp_path / "run", "--expert", "recorded", path
+    )
+    assert told.startswith(
+        f"recording '{path}', row 0: its state is observed as -1 at index 0, recorded is 1: it is "
+    )
+
+
+# what demonstrations teach
+
+
+def taught(tmp_path, columns, algorithm, *words):
+    """The summary of a tiny run on demonstrations alone."""
+    path = saved(tmp_path / "x.npz", columns)
+    words = ["--algorithm", algorithm, "--batch-size", "32", "--hidden", "32", *words]
+    out = tmp_path / "run"
+    main(["train", "probe", *words, "--expert", "recorded", str(path), "--out", str(out)])
+    return json.loads((out / "summary.json").read_text())
+
+
+REPEATED = 400  # steps
+
+
+def test_plain_demonstrations_teach_cloning(tmp_path):
+    columns = {k: v for k, v in demonstrations(REPEATED).items() if not k.startswith("state/")}
+    summary = taught(tmp_path, columns, "bc", "--offline-updates", "500")
+    assert summary["success_rate"] == 1.0
+    assert summary["total_steps"] == summary["human_data_usage"] == REPEATED
+
+
+def test_plain_demonstrations_teach_values_against_the_novices_own_actions(tmp_path):
+    columns = {k: v for k, v in demonstrations(REPEATED).items() if not k.startswith("state/")}
+    assert taught(tmp_path, columns, "pvp", "--learning-rate", "0.003")["success_rate"] == 1.0
+
+
+def test_predictions_are_made_from_recorded_states(tmp_path):
+    words = ["--learning-rate", "0.003", "--bc-weight", "0", "--max-preference-horizon", "4"]
+    summary = taught(tmp_path, demonstrations(REPEATED), "ppl", *words)
+    assert summary["success_rate"] == 1.0  # pairs alone taught it
+
+
+def test_gail_takes_its_demonstrations_and_plays_by_itself(tmp_path, capsys):
+    words = ["--rollout-steps", "50", "--evaluate-every", "50", "--offline-updates", "200"]
+    columns = {k: v for k, v in demonstrations(REPEATED).items() if not k.startswith("state/")}
+    more = ["--total-steps", "500", "--demonstrations", "400", "--learning-rate", "0.003"]
+    summary = taught(tmp_path, columns, "gail", *words, *more)
+    assert summary["human_data_usage"] == 400
+    assert summary["total_steps"] == 500
+    assert summary["training_episodes"] >= 20 + 100 // 20  # the recorded ones, and its own
+    assert summary["success_rate"] == 1.0  # of the clone, which a few rounds do not spoil
+    capsys.readouterr()
+    path, run = tmp_path / "x.npz", tmp_path / "more"
+    more = ["--demonstrations", "410", "--total-steps", "510", *words]
+    told = refused(
+        capsys,
+        *("train", "probe", "--algorithm", "gail", *more),
+        *("--expert", "recorded", path, "--out", run),
+    )
+    assert told == "demonstrations must not exceed the recording's 400, got 410"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "lengths"),
+    [
+        ("bc", {"total_steps": 60, "demonstrations": 60, "human_capacity": 10_000}),
+        ("gail", {"total_steps": 1_000_060, "demonstrations": 60}),
+        ("iwr", {"total_steps": 60, "demonstrations": 60}),
+        ("hg_dagger", {"total_steps": 60, "demonstrations": 0}),
+    ],
+)
+def test_a_run_is_as_long_as_its_recording(algorithm, lengths, tmp_path):
+    path = saved(tmp_path / "x.npz", {k: v[:67] for k, v in demonstrations(70).items()})
+    config = run_settings("probe", algorithm, expert=f"recorded {path}").config
+    assert {name: getattr(config, name) for name in lengths} == lengths

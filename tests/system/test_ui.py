@@ -355,18 +355,14 @@ def test_bad_recordings_are_told_in_a_line(tmp_path):
     drive(made, 20)
     made.close()
     columns, _ = recording.load(tmp_path / "run")
-    with pytest.raises(UserError, match=r"max_preference_horizon must not exceed .* \(6\), got 7"):
+    with pytest.raises(UserError, match="has 6 predicted states of each step, not 7"):
         recording.interactions(columns, PROBE, 7)
-    with pytest.raises(UserError, match="not finite"):
-        recording.interactions(columns | {"reward": columns["reward"] * np.nan}, PROBE, 4)
-    with pytest.raises(UserError, match="no column 'reward'"):
-        recording.interactions({k: v for k, v in columns.items() if k != "reward"}, PROBE, 4)
     cut = columns | {"observation": columns["observation"][:, :2]}
-    with pytest.raises(UserError, match=r"observation is \(20, 2\)"):
+    with pytest.raises(UserError, match=r"column 'observation' is \[20, 2\], probe needs \[T, 3\]"):
         recording.interactions(cut, PROBE, 4)
     pickled = tmp_path / "pickled.npz"
     np.savez(pickled, observation=np.array([{}], object))
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="array 'observation' holds Python objects"):
         recording.load(pickled)
 
 
@@ -537,14 +533,6 @@ def test_recordings_that_cannot_teach_are_refused(session, tmp_path):
     longer = dataclasses.replace(CONFIG, total_steps=400)
     with pytest.raises(UserError, match="total_steps must not exceed the recording's 300, got 400"):
         train(dataclasses.replace(settings, config=longer), tmp_path / "run")
-    rounds, hparams = plain_settings(
-        "gail", total_steps=300, hidden=(16,), decision_interval=5, rollout_steps=100
-    )
-    with pytest.raises(UserError, match="gail plays by itself"):
-        train(
-            dataclasses.replace(settings, algorithm="gail", config=rounds, hparams=hparams),
-            tmp_path / "run",
-        )
     with pytest.raises(UserError, match=r"is of probe, not of driving"):
         length_of(session, "driving")
     assert not (tmp_path / "run").exists()
@@ -585,7 +573,7 @@ def test_consent_and_questions_are_read_and_checked(tmp_path):
         read_consent(file)
     file.write_text(" We record.\n")
     assert read_consent(file) == "We record."
-    with pytest.raises(UserError, match=r"cannot be read: .*No such file"):
+    with pytest.raises(UserError, match="cannot be read: Expecting value"):
         read_questions(file)
     file.write_text('[{"name": "load", "text": "How?", "choices": ["a", 2]}]')
     assert read_questions(file) == (Question("load", "How?", ("a", "2")),)
