@@ -1,7 +1,7 @@
 """Recorded MetaDrive scenarios as scenarios of this environment.
 
 A recording is one `md_<number>.npz` whose `meta` (a JSON string) lists every lane, the route, the
-ego's parameters, objects and traffic. Only `meta` is needed to drive on it.
+ego's parameters, objects and traffic. Only `meta` is needed to drive on it. No pickle is read.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
+from envs.driving.recorded_fields import check_description
 from envs.driving.roads import EXTEND, SHRINK, STRAIGHT, Lane, RoadNetwork, arc, straight
 from envs.driving.scenario import Description, ObjectSpec, VehicleSpec
+from ppl_jax.npz import read_npz
 
 _OBJECT_KINDS = {"TrafficCone": "cone", "TrafficWarning": "warning", "TrafficBarrier": "barrier"}
 
@@ -39,16 +39,33 @@ def load_recording(path: str | Path) -> Description:
         ValueError: If the file is no recording, or a field that is needed is missing.
     """
     try:
-        with np.load(path) as archive:
-            meta = json.loads(str(archive["meta"]))
+        arrays = read_npz(path)
+        if "meta" not in arrays:
+            raise ValueError("it has no array 'meta'")
+        try:
+            meta = json.loads(str(arrays["meta"]))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"its meta is no JSON ({error})") from error
+        check_description(meta)
         return _describe(meta)
-    except (KeyError, OSError, StopIteration, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a recorded scenario: {error!r}") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is not a recorded scenario: {error}") from error
 
 
 def load_recordings(folder: str | Path) -> list[Description]:
-    """Read all recordings of a folder (see `recording_paths`)."""
-    return [load_recording(path) for path in recording_paths(folder)]
+    """Read all recordings of a folder (see `recording_paths`).
+
+    Raises:
+        ValueError: If one is no recording, or two have the same number.
+    """
+    found: dict[int, tuple[Path, Description]] = {}
+    for path in recording_paths(folder):
+        description = load_recording(path)
+        number = description.number
+        if number in found:
+            raise ValueError(f"{path} has scenario number {number}, which {found[number][0]} has")
+        found[number] = path, description
+    return [description for _, description in found.values()]
 
 
 def _describe(meta: dict) -> Description:
@@ -57,7 +74,11 @@ def _describe(meta: dict) -> Description:
     # the wedge beside each ramp: the recording tells where it lies, the block which way it closes
     tapers = iter([SHRINK if kind == "r" else EXTEND for kind in blocks if kind in "rR"])
     for entry in meta["lanes"]:
-        taper = next(tapers) if entry["type"] == "ExtendingLane" else STRAIGHT
+        taper = STRAIGHT
+        if entry["type"] == "ExtendingLane":
+            taper = next(tapers, None)
+            if taper is None:
+                raise ValueError("lanes hold more wedges (ExtendingLane) than blocks (r, R) have")
         network.add_lane(tuple(entry["index"][:2]), _lane(entry, taper))
     ego = meta["ego"]
     return Description(

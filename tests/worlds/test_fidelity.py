@@ -99,5 +99,5 @@ def test_a_broken_or_missing_recording_is_named(tmp_path):
     with pytest.raises(ValueError, match="holds no md_"):
         load_recordings(tmp_path)
     (tmp_path / "md_1.npz").write_bytes(b"no recording")
-    with pytest.raises(ValueError, match=r"md_1\.npz is not a recorded scenario"):
+    with pytest.raises(ValueError, match=r"md_1\.npz is not a recorded scenario: it is no \.npz"):
         load_recordings(tmp_path)

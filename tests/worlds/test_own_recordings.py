@@ -1,6 +1,8 @@
 """The fidelity code held against recordings of our own environments (see `tests.data.record`)."""
 
 import dataclasses
+import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -9,7 +11,7 @@ import pytest
 
 from envs.driving import fidelity as driving
 from envs.driving.maps import generate
-from envs.driving.recorded import load_recording
+from envs.driving.recorded import load_recording, load_recordings
 from envs.driving.scenario import Capacity, pack
 from envs.manipulation.fidelity import fidelity
 from tests.data import record
@@ -108,3 +110,57 @@ def test_rewards_of_wipes_that_do_not_fit_are_counted(tmp_path):
     every_fourth = np.arange(record.WIPING_STEPS) % 4 == 0
     folder = changed(WIPE, tmp_path, "reward", lambda reward: reward + 0.1 * every_fourth)
     assert fidelity(folder)["wipe_reward_agreement"] == pytest.approx(0.75)
+
+
+def description(place, value):
+    """The recording's description with what is at a place, "lanes 3 width", changed."""
+    with np.load(DRIVE) as archive:
+        meta = json.loads(str(archive["meta"]))
+    *way, last = (int(step) if step.isdigit() else step for step in place.split())
+    inner = meta
+    for step in way:
+        inner = inner[step]
+    if value is None:
+        del inner[last]
+    else:
+        inner[last] = value
+    return meta
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("lanes", None, "meta lacks 'lanes'"),
+        ("ego", [], "ego must be an object, got []"),
+        ("seed", "x", "seed must be a whole number of 0 or more, got 'x'"),
+        ("lanes 3 width", float("nan"), "lanes[3].width must be a positive number, got nan"),
+        ("lanes 3 start", [1.0], "lanes[3].start must be a list of 2, got [1.0]"),
+        ("lanes 3 type", "Spiral", "lanes[3].type must be one of StraightLane, Ex"),
+        ("ego wheel_friction", -1, "ego.wheel_friction must be a positive number, got -1"),
+        ("objects 2 pose", [0, 0, "up"], "objects[2].pose[2] must be a finite number, got 'up'"),
+        ("traffic 1 mass", 0, "traffic[1].mass must be a positive number, got 0"),
+        ("checkpoints", [">"], "checkpoints must be a list of at least 2, got ['>']"),
+        ("checkpoints 1", "moon", "checkpoints[0] uses the road ['>', 'moon'], which no lane"),
+        ("spawn_lane_index 2", 9, "spawn_lane_index[2] must be below 3, the road's lanes, got 9"),
+    ],
+)
+def test_a_scenario_that_cannot_be_is_told_to_the_field(place, value, said, tmp_path):
+    path = tmp_path / "md_1.npz"
+    np.savez(path, meta=np.str_(json.dumps(description(place, value))))
+    with pytest.raises(ValueError, match="is not a recorded scenario") as refusal:
+        load_recordings(tmp_path)
+    assert str(refusal.value).startswith(f"{path} is not a recorded scenario: {said}")
+    assert "\n" not in str(refusal.value)
+
+
+def test_two_recordings_of_one_scenario_or_pickles_are_refused(tmp_path):
+    shutil.copyfile(DRIVE, tmp_path / "md_1.npz")
+    shutil.copyfile(DRIVE, tmp_path / "md_2.npz")
+    with pytest.raises(ValueError, match=r"md_2\.npz has scenario number 1021, which .*md_1\.npz"):
+        load_recordings(tmp_path)
+    np.savez(tmp_path / "md_2.npz", allow_pickle=True, meta=np.array([{}], object))
+    with pytest.raises(ValueError, match="holds Python objects, only numbers and text are read"):
+        load_recordings(tmp_path)
+    np.savez(tmp_path / "md_2.npz", route=np.zeros(3))
+    with pytest.raises(ValueError, match="has no array 'meta'"):
+        load_recordings(tmp_path)
