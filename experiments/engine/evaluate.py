@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import functools
+import math
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 from envs import pretrained
 from envs.registry import make
 from experiments.engine.config_file import config_path, read_config
+from experiments.engine.csv_file import numbers, read_table
 from experiments.engine.fields import read_fields
 from experiments.engine.policy_file import load_meta, load_policy
 from experiments.engine.run_folder import EVALUATION, POLICY
@@ -128,20 +130,34 @@ def summarise_episodes(rows: list[EvaluationRow]) -> dict[str, float]:
 
 
 def read_evaluation(run: Path) -> list[EvaluationRow]:
-    """Rows of a run folder's evaluation.csv."""
-    with open(run / EVALUATION, newline="") as file:
-        return [
-            EvaluationRow(
-                step=int(row["step"]),
-                scenario=int(row["scenario"]),
-                success=int(row["success"]),
-                episodic_return=float(row["episodic_return"]),
-                progress=float(row["progress"]),
-                episodic_cost=float(row["episodic_cost"]),
-                length=int(row["length"]),
+    """Rows of a run folder's evaluation.csv; one that is there twice counts once.
+
+    Raises:
+        UserError: If there is none, or one line naming row and column of what cannot be right.
+    """
+    path = run / EVALUATION
+    table = read_table(path)
+    columns = {}
+    for name, kind in typing.get_type_hints(EvaluationRow).items():
+        if name not in table.columns:
+            raise UserError(f"{str(path)!r} has no column {name!r}")
+        whole = kind is int
+        high = 1 if name == "success" else math.inf
+        low = 0 if whole else -math.inf
+        found = numbers(
+            table.column(name), table.lines, name, path, low=low, high=high, whole=whole
+        )
+        columns[name] = [int(value) for value in found] if whole else found
+    rows = {}
+    for line, values in zip(table.lines, zip(*columns.values(), strict=True), strict=True):
+        row = EvaluationRow(**dict(zip(columns, values, strict=True)))
+        before, first = rows.setdefault((row.step, row.scenario), (line, row))
+        if first != row:
+            raise UserError(
+                f"{str(path)!r}, rows {before} and {line}: step {row.step}, scenario "
+                f"{row.scenario} is there twice, with different results"
             )
-            for row in csv.DictReader(file)
-        ]
+    return [row for _, row in rows.values()]
 
 
 def policy_path(run: Path) -> Path:

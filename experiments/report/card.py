@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
+import math
 import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 from envs import pretrained
+from experiments.engine.config_file import read_config
+from experiments.engine.csv_file import numbers, read_table
 from experiments.engine.evaluate import (
     EvaluationRow,
     policy_path,
@@ -18,8 +20,9 @@ from experiments.engine.evaluate import (
     summarise_episodes,
 )
 from experiments.engine.expert_settings import read_settings
+from experiments.engine.fields import read_fields, read_json
 from experiments.engine.files import as_json, write_text_atomic
-from experiments.engine.run_folder import METRICS, SUMMARY, RunFolder
+from experiments.engine.run_folder import EVALUATION, METRICS, SUMMARY, RunFolder
 from experiments.engine.runtime import UserError
 from experiments.options.expert import command_of
 from experiments.report.tables import write_rows
@@ -42,9 +45,12 @@ def write_card(run: Path, out: Path, *, force: bool = False) -> None:
     settings = read_settings(folder)
     if not (run / SUMMARY).is_file():
         raise UserError(f"{str(run)!r} has not finished: ppl expert train --resume --out {run}")
-    config = folder.config()
-    summary, env = folder.read_json(SUMMARY), settings.env
+    config, where, env = read_config(run), repr(str(run / SUMMARY)), settings.env
+    kinds = {"total_steps": int, "wall_s": float, "steps_per_s": float}
+    summary = read_fields(read_json(run / SUMMARY), kinds, where, needed=tuple(kinds))
     rows = read_evaluation(run)
+    if not any(row.step == summary["total_steps"] for row in rows):
+        raise UserError(f"{str(run / EVALUATION)!r} has no row of step {summary['total_steps']}")
     refuse_to_overwrite(out, env, force=force)
     out.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(policy_path(run), out / f"{env}.npz")
@@ -66,9 +72,7 @@ def write_card(run: Path, out: Path, *, force: bool = False) -> None:
         "steps_per_s": summary["steps_per_s"],
         "config": dataclasses.asdict(settings.config),
         "hparams": {k: float(v) for k, v in dataclasses.asdict(settings.hparams).items()},
-        "device": config["device"],
-        "versions": config["versions"],
-        "revision": config["revision"],
+        **{name: config.get(name) for name in ("device", "versions", "revision")},
     }
     write_text_atomic(out / f"{env}.json", as_json(card, indent=2) + "\n")
 
@@ -90,8 +94,7 @@ def refuse_to_overwrite(out: Path, env: str, *, force: bool) -> None:
 
 def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:
     """A row per evaluation: means of training since the one before, and the held-out scenarios."""
-    with open(folder.path / METRICS) as file:
-        logged = [json.loads(line) for line in file]
+    logged = _logged(folder.path / METRICS)
     table, before = [], -1
     for step in sorted({row.step for row in rows}):
         batches = [line for line in logged if before < line["step"] <= step]
@@ -106,7 +109,35 @@ def curve(folder: RunFolder, rows: list[EvaluationRow]) -> list[dict[str, Any]]:
     return table
 
 
+def _logged(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl.
+
+    Raises:
+        UserError: One line naming the line that is none.
+    """
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+        where = f"{str(path)!r}, line {number}"
+        try:
+            content = json.loads(line) if line.strip() else None
+        except ValueError as error:
+            raise UserError(f"{where} is no JSON ({error})") from error
+        if content is not None:
+            kinds = {"step": int} | {f"train/{name}": float for name in TRAINING}
+            found.append(read_fields(content, kinds, where, needed=("step",)))
+    return found
+
+
 def read_curve(path: Path) -> list[dict[str, float]]:
-    """A curve's rows as numbers; what was not measured is left out."""
-    with open(path, newline="") as file:
-        return [{k: float(v) for k, v in row.items() if v != ""} for row in csv.DictReader(file)]
+    """A curve's rows as numbers; what was not measured is left out.
+
+    Raises:
+        UserError: One line naming row and column of what is no number.
+    """
+    table = read_table(path)
+    columns = {
+        name: numbers(table.column(name), table.lines, name, path, empty=True)
+        for name in table.columns
+    }
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [{k: v for k, v in row.items() if not math.isnan(v)} for row in rows]

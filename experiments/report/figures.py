@@ -6,7 +6,6 @@ many seeds, and in which units.
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.engine.fields import read_fields, read_json
 from experiments.engine.runtime import UserError, need
 from experiments.report.points import (
     NOTHING,
@@ -24,6 +24,7 @@ from experiments.report.points import (
     common_over,
     describe,
     known,
+    number_column,
     read_csv,
     read_points,
 )
@@ -383,7 +384,14 @@ def what_horizons_cost(measured: Path, results: Sequence[Path], out: Path) -> No
     """
     frame = _measured(measured, "horizon")
     names = ["seed", "step", "predicted_step", "drift", "coverage", "gap", "error"]
-    frame = frame[names].astype(float)
+    for name in names:
+        frame[name] = number_column(measured, frame, name, whole=name in names[:3])
+    frame = frame[names].drop_duplicates()
+    if (twice := frame.duplicated(names[:3])).any():
+        raise UserError(
+            f"{str(measured)!r}, row {frame.index[twice][0]}: the same seed, step and predicted "
+            "step as in a row before, with other numbers"
+        )
     seeds = frame["seed"].nunique()
     # one row per predicted step, one column per measured value and training step
     mean = frame.pivot_table(index="predicted_step", columns="step", values=names[3:])
@@ -482,11 +490,11 @@ def expert_curves(folder: Path, out: Path) -> None:
 
 def _expert_row(panels: Any, path: Path) -> None:
     """Success, cost and multiplier over one expert's training."""
-    import pandas as pd
-
-    limit = json.loads(path.with_suffix(".json").read_text())["hparams"]["cost_limit"]
-    frame: Frame = pd.read_csv(path)
-    steps = frame["step"] / 1e6
+    card, where = path.with_suffix(".json"), repr(str(path.with_suffix(".json")))
+    held = read_fields(read_json(card), {"hparams": dict}, where, needed=("hparams",))["hparams"]
+    limits = read_fields(held, {"cost_limit": float}, f"{where}, hparams", needed=("cost_limit",))
+    limit, frame = limits["cost_limit"], read_csv(path)
+    steps = number_column(path, frame, "step", whole=True, low=0) / 1e6
     success, cost, multiplier = panels
     for axes, column, label, dash in (
         (success, "held_out_success_rate", "held out, without noise", "-"),
@@ -495,6 +503,7 @@ def _expert_row(panels: Any, path: Path) -> None:
         (cost, "train_episodic_cost", "in training", ":"),
         (multiplier, "train_multiplier", "multiplier", "-"),
     ):
+        frame[column] = number_column(path, frame, column, empty=True)
         axes.plot(steps, frame[column], dash, label=label)
     success.set_ylim(0, 1.03)
     success.set_ylabel(f"{path.stem}\nsuccess")
@@ -520,14 +529,17 @@ def growth(measured: Path, out: Path) -> None:
         UserError: If the file is another.
     """
     frame = _measured(measured, "growth")
+    if "axis" not in frame:
+        raise UserError(f"{str(measured)!r} has no column 'axis'")
+    for name in ("value", "cpu_ms", "cpu_ms_per_step"):
+        frame[name] = number_column(measured, frame, name, low=0)
     names = [name for name in GROWTH if (frame["axis"] == name).any()]
     picture, rows = _canvas(2, -(-len(names) // 2), (11, 6.2))
     for panel in rows.ravel()[len(names) :]:
         panel.set_visible(False)
     for name, axes in zip(names, rows.ravel(), strict=False):
-        here = frame[frame["axis"] == name].astype({"value": float, "cpu_ms": float})
-        whole = name == "steps"
-        cost = here["cpu_ms"] / 1e3 if whole else here["cpu_ms_per_step"].astype(float)
+        here, whole = frame[frame["axis"] == name], name == "steps"
+        cost = here["cpu_ms"] / 1e3 if whole else here["cpu_ms_per_step"]
         axes.plot(here["value"], cost, "o-", color="C0")
         axes.set(xlabel=GROWTH[name], ylabel="CPU-s" if whole else "CPU-ms per step")
         axes.set_ylim(0, 1.15 * cost.max())

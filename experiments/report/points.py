@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from experiments.engine.config_file import read_config
+from experiments.engine.csv_file import numbers, read_table
+from experiments.engine.fields import read_fields, read_json
 from experiments.engine.files import write_text_atomic
 from experiments.engine.run_folder import CONFIG, EVALUATION, SUMMARY
 from experiments.engine.runtime import UserError
@@ -159,23 +161,34 @@ def results_path(path: Path) -> Path:
 
 
 def read_csv(path: Path) -> Frame:
-    """A CSV file with every cell as text; an index column that pandas wrote is dropped.
+    """A CSV file with every cell as text, under today's names, by the line that each row is in.
 
     Raises:
         UserError: If it cannot be read.
     """
     import pandas as pd
 
-    try:
-        frame: Frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:  # pandas' parsing errors are ValueErrors
-        raise UserError(f"{str(path)!r} cannot be read: {error}") from error
-    frame = frame.loc[:, [not str(name).startswith("Unnamed:") for name in frame.columns]]
+    columns, rows, lines = read_table(path)
+    frame: Frame = pd.DataFrame(rows, columns=columns, index=lines, dtype=object)
     frame = frame.rename(columns=RENAMED)
     for column, renamed in RENAMED_VALUES.items():
         if column in frame:
             frame[column] = frame[column].replace(renamed)
     return frame
+
+
+def number_column(path: Path, frame: Frame, name: str, **allowed: Any) -> Any:
+    """A column of `read_csv` as numbers (see `experiments.engine.csv_file.numbers`).
+
+    Raises:
+        UserError: If it is missing, or one line of the first cell that is no such number.
+    """
+    import pandas as pd
+
+    if name not in frame:
+        raise UserError(f"{str(path)!r} has no column {name!r}")
+    found = numbers(frame[name].tolist(), frame.index.tolist(), name, path, **allowed)
+    return pd.Series(found, index=frame.index, dtype=float)
 
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -190,17 +203,16 @@ def _read_run(path: Path) -> Frame:
     """The evaluations of a single run, a row per step and scenario."""
     if not (path / EVALUATION).is_file():
         raise UserError(f"run {str(path)!r} has no {EVALUATION} yet: nothing was evaluated")
-    try:
-        config = json.loads((path / CONFIG).read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{str(path / CONFIG)!r} cannot be read: {error}") from error
+    config = read_config(path)
     frame = read_csv(path / EVALUATION)
     for name in ("env", "algorithm", "seed"):
-        frame[name] = str(config.get(name, ""))
+        frame[name] = str(config.get(name, "0" if name == "seed" else ""))
     if (path / SUMMARY).is_file():
-        summary = json.loads((path / SUMMARY).read_text())
-        if "training_cost" in summary:
-            last = frame["step"].astype(float) == float(summary["total_steps"])
+        kinds = {"training_cost": float, "total_steps": int}
+        summary = read_fields(read_json(path / SUMMARY), kinds, repr(str(path / SUMMARY)))
+        if kinds.keys() <= summary.keys():
+            step = number_column(path / EVALUATION, frame, "step", whole=True, low=0)
+            last = step == summary["total_steps"]
             frame["training_cost"] = np.where(last, f"{summary['training_cost']:g}", "")
     return frame
 
@@ -212,9 +224,10 @@ def read_frame(path: Path) -> Frame:
         UserError: If they are no results.
     """
     if path.is_dir() and is_run(path):
-        frame, named = _read_run(path), path.name
+        frame, named, path = _read_run(path), path.name, path / EVALUATION
     else:
-        frame, named = read_csv(results_path(path)), path.stem
+        path = results_path(path)
+        frame, named = read_csv(path), path.stem
     if frame.empty or "success" not in frame or not {"seed", "scenario"} & set(frame.columns):
         raise UserError(
             f"{str(path)!r} holds no results of ppl train, sweep, compare, ablation or tune"
@@ -227,27 +240,50 @@ def read_frame(path: Path) -> Frame:
     if "status" in frame:
         frame = frame[frame["status"] == "done"].copy()
     for name in ("seed", "step", *(["scenario"] if "scenario" in frame else [])):
-        frame[name] = _numbers(path, frame, name, whole=True)
+        frame[name] = number_column(path, frame, name, whole=True, low=0).astype(int)
     for name in MEASURED:
         if name in frame:
-            frame[name] = _numbers(path, frame, name)
-    return frame
+            allowed = _RANGES.get(name, {}) | {"empty": name != "success"}
+            frame[name] = number_column(path, frame, name, **allowed)
+    for name in _settings(frame):
+        frame[name] = frame[name].map(_plain)
+    return _once(path, frame)
 
 
-def _numbers(path: Path, frame: Frame, name: str, whole: bool = False) -> Any:
-    """A column as numbers; an empty cell of a measured one is NaN."""
-    import pandas as pd
+_RANGES = {"success": {"low": 0, "high": 1}}
+_RANGES |= {name: {"low": 0} for name in (*COUNTS, "episodic_cost", "length")}
 
-    found: Any = pd.to_numeric(frame[name], errors="coerce")
-    wrong = found.isna() & ((frame[name] != "") | whole)
-    if whole:
-        wrong |= found % 1 != 0
-    if wrong.any():
-        at = wrong.idxmax()
-        kind = "a whole number" if whole else "a number"
-        told = frame.loc[at, name]
-        raise UserError(f"{str(path)!r}, row {at + 2}: {name} must be {kind}, got {told!r}")
-    return found.astype(int) if whole else found
+
+def _settings(frame: Frame) -> list[str]:
+    return [name for name in frame.columns if name not in _NOT_SETTINGS]
+
+
+def _once(path: Path, frame: Frame) -> Frame:
+    """Every run's row at a step (and scenario) once, where it is there several times.
+
+    Raises:
+        UserError: If two such rows contradict each other.
+    """
+    names = ["env", "algorithm", *_settings(frame), "seed", "step"]
+    names += ["scenario"] if "scenario" in frame else []
+    which = frame.groupby(names, sort=False).ngroup().to_numpy()
+    _, first = np.unique(which, return_index=True)
+    if len(first) == len(frame):
+        return frame
+    measured = [name for name in MEASURED if name in frame]
+    values = frame[measured].to_numpy(float)
+    before = first[which]
+    differs = (values != values[before]) & ~(np.isnan(values) & np.isnan(values[before]))
+    if differs.any():
+        at, column = np.argwhere(differs)[0]
+        row, lines = frame.iloc[at], [frame.index[i] for i in (before[at], at)]
+        what = f"{row['algorithm']}, seed {row['seed']}, step {row['step']}"
+        found = " and ".join(f"{values[i, column]:g}" for i in (before[at], at))
+        raise UserError(
+            f"{str(path)!r}, rows {lines[0]} and {lines[1]}: the same run ({what}) has "
+            f"{measured[column]} {found}"
+        )
+    return frame.iloc[np.sort(first)].copy()
 
 
 def _plain(value: str) -> str:
@@ -270,9 +306,7 @@ def read_points(path: Path) -> list[Point]:
         UserError: If there are no results.
     """
     frame = read_frame(path)
-    settings = [name for name in frame.columns if name not in _NOT_SETTINGS]
-    for name in settings:
-        frame[name] = frame[name].map(_plain)
+    settings = _settings(frame)
     played = frame if "scenario" in frame else _episodes(path)
     points = []
     for (env, algorithm), mine in frame.groupby(["env", "algorithm"], sort=False):

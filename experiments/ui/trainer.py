@@ -7,7 +7,6 @@ continues as if it had never stopped.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import threading
 import time
@@ -29,7 +28,7 @@ from experiments.engine.files import as_json
 from experiments.engine.policy_file import save_policy
 from experiments.engine.recording import PredictedPath, Recorder
 from experiments.engine.run import algorithm_factory, restore_learner, saved_policy
-from experiments.engine.run_folder import POLICY, SUMMARY, RunFolder
+from experiments.engine.run_folder import EVALUATION, POLICY, SUMMARY, RunFolder
 from experiments.engine.settings import RunSettings
 from ppl_jax import checkpoint
 from ppl_jax.interaction import Learner, summarise
@@ -314,9 +313,8 @@ class InteractiveTrainer:
         return summarise_episodes([row for row in self._evaluated() if row.step == steps])
 
     def _evaluated(self) -> list[Any]:
-        with contextlib.suppress(FileNotFoundError):
-            return read_evaluation(self.folder.path)
-        return []
+        run = self.folder.path
+        return read_evaluation(run) if (run / EVALUATION).exists() else []
 
     def summary(self, scores: dict[str, float], more: dict[str, Any]) -> dict[str, Any]:
         """Write and return summary.json."""

@@ -11,10 +11,12 @@ import envs
 from experiments.cli import main
 from experiments.engine import recording
 from experiments.engine.config_file import read_config
+from experiments.engine.evaluate import read_evaluation
 from experiments.engine.expert_settings import ExpertSettings, settings_for
 from experiments.engine.policy_file import load_policy
 from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, run_settings
+from experiments.report import points
 from experiments.ui.play import read_questions, resumed
 from tests.helpers import Probe
 
@@ -528,3 +530,200 @@ def test_a_run_is_as_long_as_its_recording(algorithm, lengths, tmp_path):
     path = saved(tmp_path / "x.npz", {k: v[:67] for k, v in demonstrations(70).items()})
     config = run_settings("probe", algorithm, expert=f"recorded {path}").config
     assert {name: getattr(config, name) for name in lengths} == lengths
+
+
+# results
+
+HEADER = "algorithm,seed,step,success,beta"
+ROWS = [f"ppl,{seed},{step},0.{seed + 1},0.1" for seed in range(3) for step in (1000, 2000)]
+
+
+def lines(*more, header=HEADER, rows=ROWS):
+    return [header, *rows, *more]
+
+
+def told(points):
+    """What result rows say: label, step, seeds and success."""
+    return [
+        (p.label, p.step, p.seeds, p.measured["success"].round(6).tolist())
+        for p in sorted(points, key=lambda p: p.step)
+    ]
+
+
+EXPECTED = [("ppl", step, [0, 1, 2], [0.1, 0.2, 0.3]) for step in (1000, 2000)]
+
+
+def through_pandas(path):
+    """As pandas writes them: an index, and whole numbers as 2000.0."""
+    import pandas as pd
+
+    frame = pd.read_csv(io.StringIO("\n".join(lines())))
+    frame.astype({"seed": float, "step": float}).to_csv(path)
+
+
+def text(joint="\n", encoding="utf-8", given=None, end="\n"):
+    content = joint.join(lines() if given is None else given) + end
+    return lambda path: path.write_bytes(content.encode(encoding))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        through_pandas,
+        text(),
+        text(end=""),
+        text(end="\n\n\n,,,,\n"),
+        text("\r\n"),
+        text("\r"),
+        text(encoding="utf-8-sig"),
+        text(encoding="utf-16"),
+        text(encoding="latin-1", given=[line + ",é" for line in lines()]),
+        text(given=[line.replace(",", ";") for line in lines()]),
+        text(given=[line.replace(",", "\t") for line in lines()]),
+        text(given=['"' + line.replace(",", '","') + '"' for line in lines()]),
+        text(given=[line.replace(",", " , ") for line in lines()]),
+        text(given=[f"{i}," + line if i else "index," + line for i, line in enumerate(lines())]),
+        text(
+            given=[f"{i}," + line if i else "Unnamed: 0," + line for i, line in enumerate(lines())]
+        ),
+        text(given=lines(*ROWS)),  # all of them twice
+        text(given=lines(*lines())),  # two files one behind the other
+        text(given=lines("ppl,2.0,2e3,0.30,.1")),  # a row twice, otherwise written
+    ],
+)
+def test_results_through_other_programs_are_the_same(write, tmp_path):
+    path = tmp_path / "results.csv"
+    write(path)
+    assert told(points.read_points(path)) == EXPECTED
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", " is empty: it has no header"),
+        ("\n\n", " is empty: it has no header"),
+        (HEADER, " holds no results of ppl"),
+        ("a,b\n1,2\n", " holds no results of ppl"),
+        (b"PK\x03\x04\x00\x00", " cannot be read: it is no text"),
+        (
+            lines("ppl,x,3000,0.5,0.1"),
+            ", row 8: seed must be a whole number of 0 or more and at mo",
+        ),
+        (lines("ppl,-1,3000,0.5,0.1"), ", row 8: seed must be a whole number of 0 or more and at"),
+        (lines("ppl,1e30,3000,0.5,0.1"), ", row 8: seed must be a whole number of 0 or more and"),
+        (lines("ppl,0,30.5,0.5,0.1"), ", row 8: step must be a whole number of 0 or more and"),
+        (lines("ppl,0,-5,0.5,0.1"), ", row 8: step must be a whole number of 0 or more and"),
+        (lines("ppl,0,3000,1.5,0.1"), ", row 8: success must be a finite number from 0 to 1, got"),
+        (lines("ppl,0,3000,nan,0.1"), ", row 8: success must be a finite number from 0 to 1, got"),
+        (lines("ppl,0,3000,inf,0.1"), ", row 8: success must be a finite number from 0 to 1, got"),
+        (lines("ppl,0,3000,,0.1"), ", row 8: success must be a finite number from 0 to 1, got ''"),
+        (lines("ppl,0,3000,0.5"), ", row 8 has 4 cells, the header has 5"),
+        (lines("ppl,0,3000,0.5,0.1,7"), ", row 8 has 6 cells, the header has 5"),
+        (
+            lines("algorithm,seed,step,success,gamma", "ppl,0,3000,0.5,0.1"),
+            ", row 8 is a header of other columns: files whose columns differ",
+        ),
+        (
+            lines("ppl,1,2000,0.25,0.1"),
+            ", rows 5 and 8: the same run (ppl, seed 1, step 2000) has success 0.2 and 0.25",
+        ),
+        (lines(header="algorithm,seed,step,success,success"), " has the column 'success' twice"),
+        (lines('ppl,0,3000,"0.5,0.1'), ", row 8: unexpected end of data"),
+    ],
+)
+@pytest.mark.parametrize("command", ["table", "figure"])
+def test_results_that_cannot_be_right_are_told_to_the_row(content, said, command, tmp_path, capsys):
+    path = tmp_path / "results.csv"
+    if isinstance(content, list):
+        content = "\n".join(content) + "\n"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    words = [command, path, *(["--out", tmp_path / "x.png"] if command == "figure" else [])]
+    assert refused(capsys, *words).startswith(f"'{path}'{said}")
+
+
+def test_a_scenario_that_is_there_twice_counts_once(tmp_path):
+    header, rows = "algorithm,seed,step,scenario,success", ["ppl,0,10,1,1", "ppl,0,10,2,0"]
+    path = tmp_path / "episodes.csv"
+    path.write_text("\n".join([header, *rows, rows[0]]))
+    (point,) = points.read_points(path)
+    assert point.measured["success"].tolist() == [0.5]
+    assert point.scenarios == [1, 2]
+    path.write_text("\n".join([header, *rows, "ppl,0,10,2,1"]))
+    with pytest.raises(UserError, match=r"rows 3 and 4: the same run .* has success 0 and 1"):
+        points.read_points(path)
+
+
+EVALUATED = "step,scenario,success,episodic_return,progress,episodic_cost,length"
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (["10,1000,2,0,0,0,5"], ", row 2: success must be a whole number from 0 to 1, got '2'"),
+        (["10,1000,1,nan,0,0,5"], ", row 2: episodic_return must be a finite number, got 'nan'"),
+        (["10,1000,1,0,0,0"], ", row 2 has 6 cells, the header has 7"),
+        (
+            ["10,1000,1,0,0,0,5", "10,1000,0,0,0,0,5"],
+            ", rows 2 and 3: step 10, scenario 1000 is there twice, with different results",
+        ),
+    ],
+)
+def test_an_evaluation_that_cannot_be_right_is_refused(rows, said, tmp_path):
+    path = tmp_path / "evaluation.csv"
+    path.write_text("\r\n".join([EVALUATED, *rows]))
+    with pytest.raises(UserError) as refusal:
+        read_evaluation(tmp_path)
+    assert str(refusal.value) == f"'{path}'{said}"
+
+
+def test_an_evaluation_is_read_with_its_rows_once(tmp_path):
+    row = "10.0,1000,1,0.5,0,0,5"
+    (tmp_path / "evaluation.csv").write_text("\n".join([EVALUATED, row, row]))
+    (found,) = read_evaluation(tmp_path)
+    assert (found.step, found.success, found.episodic_return) == (10, 1, 0.5)
+    (tmp_path / "evaluation.csv").write_text("step\n1\n")
+    with pytest.raises(UserError, match="has no column 'scenario'"):
+        read_evaluation(tmp_path)
+
+
+MEASURED = "seed,step,predicted_step,drift,coverage,gap,error"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([MEASURED, "0,10,1,x,0,0,0"], ", row 2: drift must be a finite number, got 'x'"),
+        ([MEASURED, "0,10,1.5,0,0,0,0"], ", row 2: predicted_step must be a whole number"),
+        ([MEASURED, "0,10,1,0,0,0,0", "0,10,1,0,0,0,1"], ", row 3: the same seed, step and"),
+        (["predicted_step,seed", "1,0"], " has no column 'step'"),
+        (["axis,value,cpu_ms,cpu_ms_per_step", "steps,1,?,2"], ", row 2: cpu_ms must be a finite"),
+        (["value,cpu_ms_per_step", "1,2"], " has no column 'axis'"),
+    ],
+)
+def test_measured_files_that_cannot_be_right_are_refused(content, said, tmp_path, capsys):
+    path = tmp_path / "measured.csv"
+    path.write_text("\n".join(content))
+    told = refused(capsys, "figure", path, "--out", tmp_path / "x.png")
+    assert told.startswith(f"'{path}'{said}")
+
+
+@pytest.mark.parametrize(
+    ("card", "curve", "said"),
+    [
+        ("{", "step", "/a.json' cannot be read: Expecting property name"),
+        ("[]", "step", "/a.json' must hold an object, got []"),
+        ('{"hparams": {}}', "step", "/a.json', hparams lacks 'cost_limit'"),
+        (
+            '{"hparams": {"cost_limit": "x"}}',
+            "step",
+            "/a.json', hparams: cost_limit must be a numb",
+        ),
+        ('{"hparams": {"cost_limit": 1}}', "steps\n1", "/a.csv' has no column 'step'"),
+        ('{"hparams": {"cost_limit": 1}}', "step\nsoon", "/a.csv', row 2: step must be a whole nu"),
+    ],
+)
+def test_cards_of_experts_that_cannot_be_right_are_refused(card, curve, said, tmp_path, capsys):
+    (tmp_path / "a.json").write_text(card)
+    (tmp_path / "a.csv").write_text(curve)
+    told = refused(capsys, "figure", tmp_path, "--out", tmp_path / "x.png")
+    assert told.startswith(f"'{tmp_path}{said}")
