@@ -28,6 +28,7 @@ from experiments.engine.expert_settings import (
     check,
     read_settings,
 )
+from experiments.engine.fields import read_json
 from experiments.engine.ownership import owned
 from experiments.engine.policy_file import save_policy
 from experiments.engine.progress import Progress
@@ -102,7 +103,7 @@ def _train(
         folder.rewind(done, done)
         if done >= config.batches * config.batch_steps and (folder.path / SUMMARY).is_file():
             print(f"{folder.path} is complete already ({done} steps)", file=sys.stderr)
-            return folder.read_json(SUMMARY)
+            return read_json(folder.path / SUMMARY)
     first = done // config.batch_steps
     with Progress(config.batches * config.batch_steps, f"expert {settings.env}", done) as progress:
         run = _Run(settings, folder, env=env, functions=functions, progress=progress)

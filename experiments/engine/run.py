@@ -27,7 +27,7 @@ from experiments.engine.evaluate import (
     rows_of,
     summarise_episodes,
 )
-from experiments.engine.fields import read_fields
+from experiments.engine.fields import read_fields, read_json
 from experiments.engine.ownership import owned
 from experiments.engine.plan import Chunk, plan
 from experiments.engine.policy_file import save_policy
@@ -150,7 +150,7 @@ def _train(
         folder.rewind(done, max(evaluated, default=-1))
         if done >= chunks[-1].end and (folder.path / SUMMARY).is_file():
             print(f"{folder.path} is complete already ({done} steps)", file=sys.stderr)
-            return folder.read_json(SUMMARY)
+            return read_json(folder.path / SUMMARY)
     with Progress(chunks[-1].end, f"train {settings.env}", done) as progress:
         name = f"{settings.algorithm} in {settings.where}"
         programs.announce = lambda what: progress.compiling(f"{name}, {what}")

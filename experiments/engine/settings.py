@@ -66,7 +66,7 @@ class RunSettings:
         env, algorithm, seed: What is trained.
         config, hparams: Static and traced settings.
         expert: "scripted", "neural" (the shipped one), a policy file, "person" (see
-            `experiments.ui`) or "recorded PATH" of such a session.
+            `experiments.ui`) or "recorded PATH" of such a session or of demonstrations.
         reference_policy: Policy file of the objectives that have a reference.
         scenarios, held_out_scenarios: Folders of recorded scenarios, or None for generated ones.
         evaluate_on: "held_out", or (to choose settings by) "training", or a set that the

@@ -32,7 +32,10 @@ from experiments.options.settings import (
 from ppl_jax.config import PRESETS, Setting, TrainConfig
 
 EVALUATE_ON = "Scenarios that are played: held_out, training, or a set that `ppl list` names."
-_EXPERT = "scripted, neural (shipped), a policy file or run folder; or recorded PATH, a session."
+_EXPERT = (
+    "scripted, neural (shipped), a policy file or run folder; or recorded PATH, a session or "
+    "demonstrations."
+)
 _OWN: dict[str, list[Any]] = {
     "run": [
         ("algorithm", str, "ppl", "Method; `ppl list` names them."),

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.engine.config_file import read_config
 from experiments.engine.evaluate import EvaluationRow
-from experiments.engine.run_folder import SUMMARY, RunFolder
+from experiments.engine.fields import read_fields, read_json
+from experiments.engine.run_folder import SUMMARY
 from experiments.engine.runtime import UserError
 from experiments.report.paper import ABLATION, METHODS, Reported
 from experiments.report.points import (
@@ -269,8 +271,9 @@ def print_comparison(path: Path, reported: Mapping[str, Reported] | None = None)
 
 def print_run(run: Path) -> None:
     """The evaluation table of a run folder, one line per evaluation."""
-    folder = RunFolder(run)
-    config, summary = folder.config(), folder.read_json(SUMMARY)
+    config, kinds = read_config(run), {"episodes": int, "wall_s": float, "compile_s": float}
+    where = repr(str(run / SUMMARY))
+    summary = read_fields(read_json(run / SUMMARY), kinds, where, needed=tuple(kinds))
     columns = {"success": 2, "progress": 2, "episodic_return": 0, "episodic_cost": 2, "length": 0}
     rows = []
     for point in read_points(run):

@@ -18,7 +18,7 @@ from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings, run_settings
 from experiments.report import points
 from experiments.ui.play import read_questions, resumed
-from tests.helpers import Probe
+from tests.helpers import ROOT, Probe
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -349,6 +349,47 @@ def test_a_file_that_is_no_archive_is_told(write, said, kind, tmp_path):
     assert said in str(refusal.value)
 
 
+def policy(**changes):
+    """A policy file of the probe's size, with arrays changed, or left out where None."""
+    arrays = {"w0": np.ones((3, 1)), "b0": np.zeros(1), "activation": "relu", "output": "tanh"}
+    arrays |= {"version": 1, "meta": json.dumps({"env": "probe"})} | changes
+    return {name: np.asarray(array) for name, array in arrays.items() if array is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"version": "new"}, ": version must be a whole number, got 'new'"),
+        ({"version": [1, 2]}, ": version must be a whole number, got '[1 2]'"),
+        ({"w0": None}, " holds no layer w0, b0"),
+        ({"b0": None}, " holds no array 'b0'"),
+        ({"w2": np.ones((1, 1))}, " holds no array 'w1'"),
+        ({"w0": np.ones((3, 0)), "b0": np.zeros(0)}, ": w0 (3, 0) and b0 (0,) do not fit"),
+        ({"w0": 1.0}, ": w0 () and b0 (1,) do not fit"),
+        ({"w0": np.full((3, 1), 1e300)}, ": w0 holds a NaN or infinite number at [0, 0]"),
+        ({"b0": [np.nan]}, ": b0 holds a NaN or infinite number at [0]"),
+        ({"b0": np.array([None])}, " cannot be read: array 'b0' holds Python objects"),
+        ({"activation": ["relu"]}, ": activation must be relu or tanh"),
+        ({"meta": None}, " holds no array 'meta'"),
+        ({"meta": "{"}, ": meta must be a JSON object, got '{'"),
+        ({"meta": "[1]"}, ": meta must be a JSON object, got '[1]'"),
+        ({"meta": "{}"}, " cannot be read: its meta names no env"),
+        ({"meta": '{"env": 3}'}, " cannot be read: its meta names no env"),
+    ],
+)
+@pytest.mark.parametrize("command", ["evaluate", "export"])
+def test_a_policy_that_cannot_be_right_is_one_line(changes, said, command, tmp_path, capsys):
+    path = tmp_path / "policy.npz"
+    np.savez(path, allow_pickle=True, **policy(**changes))
+    words = [command, path, *(["--out", tmp_path / "x.npz"] if command == "export" else [])]
+    assert refused(capsys, *words).startswith(f"policy file '{path}'{said}")
+
+
+def test_whole_numbers_in_a_policy_are_taken(tmp_path):
+    np.savez(tmp_path / "x.npz", **policy(w0=np.ones((3, 1), int)))
+    assert load_policy(tmp_path / "x.npz", 3, 1).weights[0][0].sum() == 3
+
+
 def bytes_of(save, *arrays):
     file = io.BytesIO()
     save(file, *arrays)
@@ -465,6 +506,16 @@ def test_states_of_another_scenario_are_not_predicted_from(tmp_path, capsys):
 
 
 # what demonstrations teach
+
+
+def test_the_example_on_the_page_is_a_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "pages" / "playing.md").read_text()
+    exec(re.findall(r"```python\n(.*?)```", page, re.S)[0])
+    columns, _ = recording.load(tmp_path / "demonstrations.npz")
+    assert np.flatnonzero(columns["terminated"]).tolist() == [119, 214, 357]
+    shapes = [columns[name].shape for name in (OBS, "executed_action")]
+    assert shapes == [(358, 259), (358, 2)]
 
 
 def taught(tmp_path, columns, algorithm, *words):
