@@ -87,7 +87,7 @@ def checked(columns: Columns, where: str) -> Columns:
         raise UserError(f"{where}: column 'observation' has no rows")
     found = {}
     for name, about in COLUMNS.items():
-        if name in columns:
+        if name in columns and not _is_empty(name, columns[name]):
             line = f"{where}: column {name!r}"
             array = _shaped(columns[name], about, length=length, sizes=sizes, line=line)
             found[name] = _of_kind(array, about.kind, line)
@@ -98,6 +98,11 @@ def checked(columns: Columns, where: str) -> Columns:
                 raise UserError(f"{where}: column {name!r} must hold numbers, got {array.dtype}")
             found[name] = array
     return found
+
+
+def _is_empty(name: str, array: np.ndarray) -> bool:
+    """Predictions of no steps, in sessions of a method that needs none."""
+    return name.startswith(PREDICTED) and array.ndim > 1 and array.shape[1] == 0
 
 
 def _under_our_names(columns: Columns, where: str) -> Columns:
