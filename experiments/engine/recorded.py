@@ -109,7 +109,8 @@ def recorded_functions(
         UserError: If the recording cannot be used, or is too short.
     """
     columns, _ = recording.load(path)
-    have = len(columns[recording.EPISODE])
+    have, where = len(columns[recording.EPISODE]), f"recording {str(path)!r}"
+    recording.refuse_other_sizes(columns, env, where)
     live = make_live(env, make_algorithm, config)
     algorithm, interval = live.algorithm, config.decision_interval
     alone = None
@@ -122,8 +123,8 @@ def recorded_functions(
         )
     states, horizon = None, algorithm.predicted_steps
     if horizon > recording.predicted_steps(columns):
-        states, horizon = _restored(columns, env, algorithm, config, path), 0
-    rows = recording.interactions(columns, env, horizon, f"recording {str(path)!r}")
+        states, horizon = _restored(columns, env, algorithm, config, where), 0
+    rows = recording.interactions(columns, env, horizon, where)
     rows, states = jax.tree.map(jnp.asarray, (rows, states))
     missing = {"states": states, "ask_novice": "novice_action" not in columns}
 
@@ -158,14 +159,14 @@ def _nobody(env: Env) -> Expert:
 
 
 def _restored(
-    columns: recording.Columns, env: Env, algorithm: Algorithm, config: TrainConfig, path: Path
+    columns: recording.Columns, env: Env, algorithm: Algorithm, config: TrainConfig, where: str
 ) -> Any:
     """The recorded states, [T], from which a method's predictions can be made.
 
     Raises:
         UserError: One line of what the recording lacks and what can be done.
     """
-    where, have = f"recording {str(path)!r}", recording.predicted_steps(columns)
+    have = recording.predicted_steps(columns)
     like = jax.eval_shape(lambda key: env.reset(key, env.default_params)[1], jax.random.key(0))
     try:
         states = recording.states(columns, like)

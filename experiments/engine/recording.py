@@ -200,6 +200,21 @@ def predicted_steps(columns: Columns) -> int:
     return columns[needed[1]].shape[1] if all(name in columns for name in needed) else 0
 
 
+def refuse_other_sizes(columns: Columns, env: Env, where: str = "recording") -> None:
+    """Check that observations and actions have the sizes of an environment.
+
+    Raises:
+        UserError: One line naming the column and both sizes.
+    """
+    for name, size in (
+        ("observation", env.spec.observation_size),
+        ("executed_action", env.spec.action_size),
+    ):
+        shape = list(columns[name].shape)
+        if shape[1] != size:
+            raise UserError(f"{where}: column {name!r} is {shape}, {env.name} needs [T, {size}]")
+
+
 def interactions(columns: Columns, env: Env, horizon: int, where: str = "recording") -> Interaction:
     """Recorded steps as passed to a method, [T].
 
@@ -212,13 +227,7 @@ def interactions(columns: Columns, env: Env, horizon: int, where: str = "recordi
     Raises:
         UserError: If they are of another environment, or hold fewer predicted states.
     """
-    for name, size in (
-        ("observation", env.spec.observation_size),
-        ("executed_action", env.spec.action_size),
-    ):
-        shape = list(columns[name].shape)
-        if shape[1] != size:
-            raise UserError(f"{where}: column {name!r} is {shape}, {env.name} needs [T, {size}]")
+    refuse_other_sizes(columns, env, where)
     have = predicted_steps(columns)
     if have < horizon:
         raise UserError(f"{where} has {have} predicted states of each step, not {horizon}")

@@ -463,6 +463,8 @@ def test_a_recording_of_another_world_is_one_line(tmp_path, capsys):
     saved(path, plain() | {OBS: np.zeros((60, 2))})
     said = f"recording '{path}': column 'observation' is [60, 2], probe needs [T, 3]"
     assert refused(capsys, *train, path, "--algorithm", "bc") == said
+    saved(path, demonstrations() | {OBS: np.zeros((60, 2))})
+    assert refused(capsys, *train, path) == said
     saved(path, {k: v[:7] for k, v in plain().items()})
     said = f"recording '{path}' must have at least decision_interval (10) steps, got 7"
     assert refused(capsys, *train, path) == said
