@@ -40,16 +40,22 @@ class Table(NamedTuple):
         return [row[at] for row in self.rows]
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, *, cut: bool = False) -> Table:
     """A CSV file, or one that gzip has packed (.gz).
 
     UTF-8, UTF-16 (with its mark) and Latin-1 are read; commas, semicolons and tabs; any line ends.
     Rows without content, headers that are repeated and the index that pandas writes are left out.
 
+    Args:
+        path: The file.
+        cut: Leave out a last line without its end: it was being written when a run was killed.
+
     Raises:
         UserError: One line naming the file, and the row where there is one.
     """
     where, text = repr(str(path)), _text(path)
+    if cut:
+        text = text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
     header = text.lstrip("\r\n").splitlines()[:1]
     if not header or not header[0].strip():
         raise UserError(f"{where} is empty: it has no header")

@@ -123,7 +123,7 @@ def _logged(path: Path) -> list[dict[str, Any]]:
         except ValueError as error:
             raise UserError(f"{where} is no JSON ({error})") from error
         if content is not None:
-            kinds = {"step": int} | {f"train/{name}": float for name in TRAINING}
+            kinds = {"step": int} | {f"train/{name}": float | None for name in TRAINING}
             found.append(read_fields(content, kinds, where, needed=("step",)))
     return found
 

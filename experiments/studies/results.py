@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.csv_file import read_table
 from experiments.engine.files import write_text_atomic
 from experiments.engine.plan import evaluation_steps
 from experiments.engine.runtime import UserError
@@ -180,15 +181,21 @@ def _key(settings: Mapping[str, Any]) -> str:
 
 def _read(path: Path) -> tuple[dict[str, list[dict[str, str]]], list[str]]:
     """Rows by run, and the columns; a last line without its end is left out."""
-    text = path.read_text() if path.is_file() else ""
-    reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
-    columns = list(reader.fieldnames or [])
-    if columns and "run" not in columns:
+    if not path.is_file() or b"\n" not in path.read_bytes():  # killed within its first line
+        return {}, []
+    table = read_table(path, cut=True)
+    if "run" not in table.columns:
         raise UserError(f"{str(path)!r} is not of this kind of results: give another --out")
     found: dict[str, list[dict[str, str]]] = {}
-    for row in reader:
+    for cells in table.rows:
+        row = dict(zip(table.columns, cells, strict=True))
+        for name in _COUNTED & row.keys():  # a program that has an empty cell in it makes it 200.0
+            row[name] = row[name].removesuffix(".0")
         found.setdefault(row["run"], []).append(row)
-    return found, columns
+    return found, table.columns
+
+
+_COUNTED = {"step", "scenario", "seed", "human_data_usage", "human_cost_steps", "takeovers"}
 
 
 def _append(path: Path, columns: Sequence[str], rows: Sequence[dict[str, str]]) -> None:

@@ -12,6 +12,7 @@ import time
 import flax.struct
 import jax
 import numpy as np
+import pandas
 import pytest
 
 import envs
@@ -267,6 +268,9 @@ def test_a_sweep_that_is_killed_goes_on_to_the_same_results(tmp_path):
     assert not finished & {run for run in before if whole_run(out, run, rows)}
     assert {name: (out / name).read_bytes() for name in FILES} == whole
 
+    table = pandas.read_csv(out / "results.csv", dtype=str)  # through another program
+    table["step"] += ".0"
+    table.to_csv(out / "results.csv", sep=";", encoding="utf-16", lineterminator="\r\n")
     told = sweep(tmp_path, "killed", *words)  # and once more: nothing to do, nothing changed
     assert "12 of them done" in told.stderr
     assert {name: (out / name).read_bytes() for name in FILES} == whole
