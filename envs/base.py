@@ -68,7 +68,7 @@ class Environment:
 
     def scenario_numbers(self, params: Any) -> jax.Array:
         """Number that results name each scenario by, [S]: 0, 1, 2, ... unless overridden."""
-        return jnp.arange(self.scenario_count(params))
+        return jnp.arange(self.scenario_count(params), dtype=jnp.int32)
 
     def readings(self, state: Any) -> list[tuple[str, str]]:
         """Figures of a concrete state to show a person, as (label, text); none by default."""
@@ -78,7 +78,7 @@ class Environment:
     def reset(self, key: jax.Array, params: Any) -> tuple[jax.Array, Any]:
         """Draw a scenario and start it."""
         key_index, key_start = jax.random.split(key)
-        index = jax.random.randint(key_index, (), 0, self.scenario_count(params))
+        index = jax.random.randint(key_index, (), 0, self.scenario_count(params), jnp.int32)
         state = self.reset_to(index, key_start, params)
         return self.observe(state, params), state
 
@@ -114,4 +114,6 @@ class Environment:
             return self.reset(key, params)
 
         # a scalar condition really branches; under vmap it becomes a select
-        return jax.lax.cond(done, restart, lambda _: (observation, state), jnp.zeros(()))
+        return jax.lax.cond(
+            done, restart, lambda _: (observation, state), jnp.zeros((), jnp.float32)
+        )

@@ -79,7 +79,7 @@ def draw(
         recency: r; 0 draws all alike.
     """
     held = size(buffer)
-    rank = held * jax.random.uniform(key, shape) ** (1.0 / (1.0 + recency))
+    rank = held * jax.random.uniform(key, shape, jnp.float32) ** (1.0 / (1.0 + recency))
     rank = jnp.clip(rank.astype(jnp.int32), 0, jnp.maximum(held - 1, 0))
     return (buffer.next - held + rank) % capacity(buffer)
 
@@ -141,14 +141,16 @@ def sample_split(
     ours = sample(split.human, key_human, half, recency)
     theirs = sample(split.robot, key_robot, count - half, recency)
     items = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ours, theirs)
-    held = jnp.where(jnp.arange(count) < half, size(split.human), size(split.robot)) > 0
+    ours = jnp.arange(count, dtype=jnp.int32) < half
+    held = jnp.where(ours, size(split.human), size(split.robot)) > 0
+    held = held.astype(jnp.float32)
     return items, held / jnp.maximum(jnp.mean(held), 1e-9)
 
 
 def sample_both(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree, jax.Array]:
     """`count` items, the expert's and the novice's steps alike; weights like `sample_split`'s."""
     human, robot = size(split.human), size(split.robot)
-    row = jax.random.randint(key, (count,), 0, jnp.maximum(human + robot, 1))
+    row = jax.random.randint(key, (count,), 0, jnp.maximum(human + robot, 1), jnp.int32)
     ours = row < human
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -157,4 +159,4 @@ def sample_both(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree,
         return jnp.where(mask, a[jnp.clip(row, 0, a.shape[0] - 1)], b[theirs])
 
     items = jax.tree.map(pick, split.human.data, split.robot.data)
-    return items, jnp.ones(count) * (human + robot > 0)
+    return items, jnp.ones(count, jnp.float32) * (human + robot > 0)

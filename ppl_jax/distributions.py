@@ -182,6 +182,6 @@ def squashed_gaussian(key: jax.Array, mean: Array, log_std: Array) -> tuple[jax.
     """
     chex.assert_equal_shape([mean, log_std], custom_message="mean and log_std")
     log_std = jnp.clip(log_std, -20.0, 2.0)
-    u = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    u = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, jnp.float32)
     squashing = jnp.sum(2.0 * (jnp.log(2.0) - u - jax.nn.softplus(-2.0 * u)), -1)
     return jnp.tanh(u), gaussian_log_prob(mean, log_std, u) - squashing

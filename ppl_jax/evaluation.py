@@ -52,9 +52,9 @@ def make_evaluate(
         count = env.scenario_count(params)
         key_reset, key_run = jax.random.split(key)
         states = jax.vmap(env.reset_to, in_axes=(0, 0, None))(
-            jnp.arange(count), jax.random.split(key_reset, count), params
+            jnp.arange(count, dtype=jnp.int32), jax.random.split(key_reset, count), params
         )
-        zero = jnp.zeros(count)
+        zero = jnp.zeros(count, jnp.float32)
         start = Episodes(
             success=jnp.zeros(count, bool),
             episodic_return=zero,

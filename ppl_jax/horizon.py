@@ -135,10 +135,10 @@ class Horizon:
 def init_horizon(steps: int) -> Horizon:
     """Nothing seen yet."""
     return Horizon(
-        count=jnp.zeros(steps),
-        drift=jnp.zeros(steps),
-        reach=jnp.zeros(steps),
-        apart=jnp.zeros(()),
+        count=jnp.zeros(steps, jnp.float32),
+        drift=jnp.zeros(steps, jnp.float32),
+        reach=jnp.zeros(steps, jnp.float32),
+        apart=jnp.zeros((), jnp.float32),
     )
 
 
@@ -171,7 +171,7 @@ def errors(
 def choose(horizon: Horizon, most: jax.Array | float) -> jax.Array:
     """The L from 1 to `most` whose larger error is least; 1 before anything was seen."""
     worse = jnp.maximum(*errors(horizon.drift, horizon.reach, horizon.apart))
-    allowed = jnp.arange(1, worse.shape[0] + 1) <= most
+    allowed = jnp.arange(1, worse.shape[0] + 1, dtype=jnp.int32) <= most
     return 1.0 + jnp.argmin(jnp.where(allowed, worse, jnp.inf))
 
 
@@ -318,7 +318,7 @@ def summarise(
     share = begun[:, 0] / jnp.maximum(jnp.sum(begun), 1)
     some = jnp.where(jnp.sum(begun) > 0, share, 1.0 / share.shape[0])
     chosen = jax.random.choice(key_kept, share.shape[0], (kept,), p=some)
-    at = jax.random.randint(key_visited, (visited,), 0, share.shape[0])
+    at = jax.random.randint(key_visited, (visited,), 0, share.shape[0], jnp.int32)
     return Profile(
         wrong=mean(measured.wrong, valid),
         drift=mean(measured.drift, valid),

@@ -160,7 +160,7 @@ def init(problem: Problem, key: jax.Array, hparams: HParams) -> Learner:
             takeovers=zero,
             episodes=zero,
             successes=zero,
-            cost=jnp.zeros(()),
+            cost=jnp.zeros((), jnp.float32),
             physics_diverged=zero,
         ),
         diverged=jnp.zeros((), bool),
@@ -178,7 +178,7 @@ def propose(problem: Problem, learner: Learner, observation: jax.Array) -> jax.A
     action = problem.algorithm.act(learner.algorithm, key_act, observation)
     random_steps = problem.config.random_steps
     if random_steps:
-        guess = jax.random.uniform(key_guess, action.shape, minval=-1.0, maxval=1.0)
+        guess = jax.random.uniform(key_guess, action.shape, jnp.float32, minval=-1.0, maxval=1.0)
         action = jnp.where(learner.counters.steps < random_steps, guess, action)
     return action
 
@@ -191,7 +191,7 @@ def query_expert(
     key_expert, key_noise = jax.random.split(key)
     params = params_of(problem, learner.hparams)
     action = problem.expert(key_expert, learner.env_state, observation, params)
-    noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape)
+    noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape, jnp.float32)
     return jnp.clip(action + noise, -1.0, 1.0)
 
 
@@ -255,7 +255,7 @@ def _if_expert(
 
 def no_prediction() -> Trajectory:
     """A trajectory of no steps, of methods that make no pairs."""
-    empty = jnp.zeros((0,))
+    empty = jnp.zeros((0,), jnp.float32)
     no = empty.astype(bool)
     return Trajectory(
         observation=empty[:, None],

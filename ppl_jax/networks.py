@@ -73,7 +73,7 @@ def make_raw(spec: EnvSpec, hidden: tuple[int, ...], outputs: int) -> Network:
     mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
 
     def init(key: jax.Array) -> Params:
-        return module.init(key, jnp.zeros(spec.observation_size))
+        return module.init(key, spec.zeros()[0])
 
     def apply(params: Params, observation: jax.Array) -> jax.Array:
         return module.apply(params, (observation - mean) / scale)  # pyright: ignore[reportReturnType]
@@ -90,7 +90,7 @@ def make_critic(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Network:
     mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
 
     def init(key: jax.Array) -> Params:
-        inputs = jnp.zeros(spec.observation_size + spec.action_size)
+        inputs = jnp.concatenate(spec.zeros())
         return jax.vmap(module.init, in_axes=(0, None))(jax.random.split(key, count), inputs)
 
     def apply(params: Params, observation: jax.Array, action: jax.Array) -> jax.Array:

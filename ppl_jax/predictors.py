@@ -91,7 +91,7 @@ def add_noise(key: jax.Array, observation: jax.Array, epsilon: jax.Array | float
 
     The paper's robustness study ("imperfect predictors").
     """
-    noise = jax.random.normal(key, observation.shape)
+    noise = jax.random.normal(key, observation.shape, jnp.float32)
     norm = jnp.linalg.norm(observation, axis=-1, keepdims=True)
     length = jnp.linalg.norm(noise, axis=-1, keepdims=True)
     return observation + epsilon * norm / jnp.maximum(length, 1e-12) * noise

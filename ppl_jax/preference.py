@@ -52,7 +52,9 @@ def preference_pairs(
             f"preference_horizon must not exceed the predicted states ({count}), got "
             f"{preference_horizon}"
         )
-    mask = step.takeover & predicted.valid & (jnp.arange(count) < preference_horizon)
+    mask = (
+        step.takeover & predicted.valid & (jnp.arange(count, dtype=jnp.int32) < preference_horizon)
+    )
     observation, rejected = predicted.observation, None
     if pair_states != "future":
         observation = jnp.concatenate([step.observation[None], observation])

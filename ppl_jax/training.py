@@ -245,7 +245,7 @@ def block(problem: Problem, takeovers: Takeovers, learner: Learner) -> tuple[Lea
         return (learner, carry[1]), metrics
 
     start = learner, jnp.zeros((), bool)
-    (learner, _), metrics = jax.lax.scan(step, start, jnp.arange(interval) == 0)
+    (learner, _), metrics = jax.lax.scan(step, start, jnp.arange(interval, dtype=jnp.int32) == 0)
     return learner, jax.tree.map(jnp.mean, metrics)
 
 

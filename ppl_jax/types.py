@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ppl_jax.cards import EnvCard
@@ -59,7 +60,7 @@ class Outcome:
     unsafe: jax.Array
     progress: jax.Array
     speed: jax.Array
-    clearance: jax.Array | float = float("inf")
+    clearance: jax.Array | np.float32 | float = np.float32(np.inf)
     physics_diverged: jax.Array | bool = False
 
 
@@ -172,6 +173,13 @@ class EnvSpec(NamedTuple):
     action_size: int
     observation_mean: np.ndarray
     observation_scale: np.ndarray
+
+    def zeros(self) -> tuple[jax.Array, jax.Array]:
+        """An observation [O] and an action [A] of zeros: what buffers and networks are made for."""
+        return (
+            jnp.zeros(self.observation_size, jnp.float32),
+            jnp.zeros(self.action_size, jnp.float32),
+        )
 
 
 Expert = Callable[[jax.Array, PyTree, jax.Array, PyTree], jax.Array]

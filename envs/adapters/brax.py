@@ -56,7 +56,7 @@ class BraxState:
 
 
 def _nothing(state: Any) -> jax.Array:
-    return jnp.zeros(())
+    return jnp.zeros((), jnp.float32)
 
 
 class FromBrax(Environment):
@@ -136,7 +136,7 @@ class FromBrax(Environment):
             success=lasted if self._success is None else jnp.asarray(self._success(inner), bool),
             unsafe=cost > 0,
             progress=time / self.max_episode_steps,
-            speed=jnp.zeros(()),
+            speed=jnp.zeros((), jnp.float32),
         )
 
     def observe(self, state: BraxState, params: BraxParams) -> jax.Array:
@@ -183,7 +183,7 @@ def to_brax(env: Env, params: Any = None, auto_reset: bool = True) -> Any:
         def reset(self, rng: jax.Array) -> Any:
             key, key_start = jax.random.split(rng)
             observation, state = env.reset(key_start, given)
-            zero = jnp.zeros(())
+            zero = jnp.zeros((), jnp.float32)
             return module.State(
                 state,
                 observation,

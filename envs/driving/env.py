@@ -228,12 +228,12 @@ def push(
     velocity = jnp.concatenate([traffic.speed[:, None] * heading, box_velocity])
     is_vehicle = jnp.concatenate([jnp.ones(n, bool), scenario.objects.box_is_vehicle])
     depth = jnp.where(is_vehicle, jnp.maximum(touch.depth, 0.0), 0.0)
-    worst = jnp.argmax(depth)
+    worst = jnp.argmax(depth).astype(jnp.int32)
     out = touch.out[worst]
     closing = jnp.minimum(jnp.sum((ego.velocity - velocity[worst]) * out), 0.0)
     exchange = jnp.where(depth[worst] > 0, 0.5 * closing, 0.0) * out
     ego = dataclasses.replace(ego, velocity=ego.velocity - exchange)
-    struck = (jnp.arange(depth.shape[0]) == worst) & (depth[worst] > 0)
+    struck = (jnp.arange(depth.shape[0], dtype=jnp.int32) == worst) & (depth[worst] > 0)
     hit = struck[:, None].astype(jnp.float32)
     moved = velocity + hit * exchange
     shift = -hit * depth[worst] * out
@@ -256,7 +256,7 @@ def start_state(scenario: Scenario, index: jax.Array) -> DrivingState:
     long, zero = jnp.float32(SPAWN_LONG), jnp.zeros((), jnp.float32)
     position = lane_position(lane, long, zero)
     pose = jnp.append(position, lane_heading(lane, long))
-    ego = vehicle.place(pose, jnp.zeros(2), zero, jnp.zeros(2))
+    ego = vehicle.place(pose, jnp.zeros(2, jnp.float32), zero, jnp.zeros(2, jnp.float32))
     navigation, found = nav.localise(scenario, nav.start(scenario), pose)
     traffic = traffic_model.start(scenario)
     return DrivingState(
@@ -324,7 +324,7 @@ class Driving(Environment):
 
     def reset(self, key: jax.Array, params: DrivingParams) -> tuple[jax.Array, DrivingState]:
         """A random scenario's start."""
-        index = jax.random.randint(key, (), 0, self.scenario_count(params))
+        index = jax.random.randint(key, (), 0, self.scenario_count(params), jnp.int32)
         assert params.starts is not None
         assert params.start_observations is not None
         return params.start_observations[index], tree_index(params.starts, index)
@@ -469,7 +469,7 @@ def observe(scenario: Scenario, state: DrivingState) -> jax.Array:
 
 @jax.jit
 def _starts(pool: Scenario) -> tuple[DrivingState, jax.Array]:
-    states = jax.vmap(start_state)(pool, jnp.arange(pool.number.shape[0]))
+    states = jax.vmap(start_state)(pool, jnp.arange(pool.number.shape[0], dtype=jnp.int32))
     return states, jax.vmap(observe)(pool, states)
 
 

@@ -54,7 +54,9 @@ class Things(NamedTuple):
 def _along_route(scenario: Scenario, road: jax.Array, long: jax.Array) -> jax.Array:
     """Distance from the start of the route, m."""
     lengths = scenario.lanes.length[scenario.route_lane]
-    lengths = jnp.where(jnp.arange(lengths.shape[0]) < scenario.route_roads, lengths, 0.0)
+    lengths = jnp.where(
+        jnp.arange(lengths.shape[0], dtype=jnp.int32) < scenario.route_roads, lengths, 0.0
+    )
     starts = jnp.cumsum(lengths) - lengths
     return starts[road] + long
 
@@ -133,7 +135,7 @@ def drive(state: DrivingState, params: DrivingParams, cruise_speed: float) -> ja
     steer = jnp.arctan(WHEELBASE * bend) / MAX_STEERING
 
     # speed: bends ahead, then what is in the way of where the car is and where it goes
-    distances = jnp.arange(0.0, 41.0, 4.0)
+    distances = jnp.arange(0.0, 41.0, 4.0, dtype=jnp.float32)
     _, curvature = jax.vmap(lambda d: _point_ahead(scenario, road, long + d, target * width))(
         distances
     )
@@ -195,7 +197,7 @@ def _things(scenario: Scenario, state: DrivingState, ego_along: jax.Array) -> Th
     own = leg + traffic.number
     reference = scenario.route_lane[jnp.maximum(lanes.route[own], 0)]
     share = traffic.long / lanes.length[own] * lanes.length[reference]
-    offset = traffic.number * lanes.width[own] + traffic.lateral
+    offset = traffic.number.astype(jnp.float32) * lanes.width[own] + traffic.lateral
     half = jnp.concatenate([plan.half, objects.box_half, jnp.repeat(objects.circle[:, 2:], 2, 1)])
     strayed = jnp.sum((state.box_pose - objects.box_pose)[:, :2] ** 2, -1) > 0.25
     vehicles, boxes = traffic.status.shape[0], strayed.shape[0]
@@ -227,10 +229,11 @@ def _choose_lane(
     width: Array,
 ) -> jax.Array:
     """The lane to head for, the present one or a neighbour: the one with most free road."""
-    number = jnp.arange(LANES)
-    size = scenario.route_size[road]
+    number = jnp.arange(LANES, dtype=jnp.float32)
+    sizes = scenario.route_size.astype(jnp.float32)
     following = jnp.minimum(road + 1, scenario.route_roads - 1)
-    usable = jnp.minimum(size, scenario.route_size[following])
+    size = sizes[road]
+    usable = jnp.minimum(size, sizes[following])
     current = jnp.clip(jnp.round(here), 0, size - 1)
 
     across = jnp.abs(things.lateral - number[:, None] * width)
@@ -247,7 +250,7 @@ def _choose_lane(
     value = jnp.minimum(free, SIGHT) - _LANE_CHANGE_COST * jnp.abs(number - here)
     edge = (number == 0) | (number == usable - 1)
     value = value - jnp.where(edge & (usable > 2), _EDGE_COST, 0.0)
-    value = value - _RIGHT_COST * (number > here)
+    value = value - jnp.where(number > here, _RIGHT_COST, 0.0)
     value = jnp.where(number < usable, value, value - 200.0)
     # a lane beyond an occupied neighbour is out of reach
     step = jnp.sign(number - current)
@@ -255,5 +258,5 @@ def _choose_lane(
     shut = (step != 0) & beside[neighbour]
     value = jnp.where(shut, value - 500.0, value)
     value = jnp.where(number < size, value, -1e4)
-    best = jnp.argmax(value)
-    return jnp.clip(best, current - 1, current + 1).astype(jnp.float32)
+    best = jnp.argmax(value).astype(jnp.float32)
+    return jnp.clip(best, current - 1, current + 1)

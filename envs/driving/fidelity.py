@@ -99,7 +99,8 @@ class Recording:
 
 
 def _navigation(lane: jax.Array, road: jax.Array) -> nav.Navigation:
-    return nav.Navigation(road=road, lane=lane, travelled=jnp.zeros(()), last_long=jnp.zeros(()))
+    zero = jnp.zeros((), jnp.float32)
+    return nav.Navigation(road=road, lane=lane, travelled=zero, last_long=zero)
 
 
 def _ego(ego: jax.Array, before: jax.Array, action: jax.Array) -> vehicle.Ego:

@@ -17,7 +17,8 @@ def wrap(angle: Array) -> Array:
 
 # atan(x) / x as a polynomial in x^2 on [0, 1], Chebyshev fit, error below 1e-7
 _X = np.cos(np.pi * (np.arange(64) + 0.5) / 64) / 2 + 0.5
-_ATAN = np.polynomial.Polynomial.fit(_X, np.arctan(np.sqrt(_X)) / np.sqrt(_X), 9).convert().coef
+_FIT = np.polynomial.Polynomial.fit(_X, np.arctan(np.sqrt(_X)) / np.sqrt(_X), 9)
+_ATAN = _FIT.convert().coef.tolist()
 
 
 def arctan2(y: Array, x: Array) -> jax.Array:
@@ -161,7 +162,7 @@ def box_contact(
     c, s = jnp.abs(jnp.cos(relative)), jnp.abs(jnp.sin(relative))
     mine = to_body(delta, pose[2])
     theirs = to_body(delta, others[:, 2])
-    swap = jnp.array([1, 0])
+    swap = jnp.array([1, 0], jnp.int32)
     on_mine = half + other_half * c[:, None] + other_half[:, swap] * s[:, None] - jnp.abs(mine)
     on_theirs = other_half + half * c[:, None] + half[swap] * s[:, None] - jnp.abs(theirs)
     depths = jnp.concatenate([on_mine, on_theirs], -1)

@@ -102,7 +102,7 @@ def localise(
     reference = scenario.route_lane[road]
     width = lanes.width[lane]
     left = lateral[reference] + width / 2
-    right = scenario.route_size[road] * width - left
+    right = scenario.route_size[road].astype(jnp.float32) * width - left
     return (
         Navigation(road=road, lane=lane, travelled=travelled, last_long=long[reference]),
         Localised(long=long, lateral=lateral, on_lane=jnp.any(inside), left=left, right=right),
@@ -114,7 +114,7 @@ def arrived(scenario: Scenario, navigation: Navigation, found: Localised) -> jax
     final = tree_index(scenario.lanes, scenario.final_lane)
     long, lateral = found.long[scenario.final_lane], found.lateral[scenario.final_lane]
     width = scenario.lanes.width[navigation.lane]
-    size = scenario.route_size[navigation.road]
+    size = scenario.route_size[navigation.road].astype(jnp.float32)
     return (jnp.abs(long - final.length) < 5.0) & (
         (lateral <= width / 2) & (lateral >= (0.5 - size) * width)
     )

@@ -161,7 +161,7 @@ def _join_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
 
 @jax.custom_batching.custom_vmap
 def _side_by_side(features: jax.Array, rays: jax.Array) -> jax.Array:
-    whole = jax.lax.dynamic_update_slice(jnp.zeros(SIZE), features, (0,))
+    whole = jax.lax.dynamic_update_slice(jnp.zeros(SIZE, jnp.float32), features, (0,))
     return jax.lax.dynamic_update_slice(whole, rays, (features.shape[0],))
 
 

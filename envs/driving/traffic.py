@@ -114,8 +114,8 @@ def _neighbours(
     Returns:
         The three, each on the lanes left, here and right; infinite (a speed 0) where there is none.
     """
-    front = behind = jnp.full(beside.shape, jnp.inf)
-    speed = jnp.zeros(beside.shape)
+    front = behind = jnp.full(beside.shape, jnp.inf, jnp.float32)
+    speed = jnp.zeros(beside.shape, jnp.float32)
     # unrolled, as the lidar's boxes: a reduction over so few runs one number at a time
     for j in range(others.lane.shape[0]):
         here, delta = others.lane[j] == beside, others.long[j] - long
@@ -173,7 +173,7 @@ def advance(
         long=jnp.concatenate([traffic.long, ego_long[None], objects.long]),
         speed=jnp.concatenate([traffic.speed, ego_speed[None], jnp.zeros_like(objects.long)]),
     )
-    side = jnp.array([-1, 0, 1])[:, None]
+    side = jnp.array([-1, 0, 1], jnp.int32)[:, None]
     beside_number = traffic.number + side
     exists = (beside_number >= 0) & (beside_number < size)
     beside = jnp.where(exists, lane + side, -1)
@@ -217,7 +217,7 @@ def advance(
         jnp.where(move < 0, each[0], jnp.where(move > 0, each[2], each[1]))
         for each in (gap, front_speed, seen)
     )
-    wanted = 10.0 + 1.5 * speed + speed * (speed - ahead_speed) / (2 * jnp.sqrt(5.0))
+    wanted = 10.0 + 1.5 * speed + speed * (speed - ahead_speed) / (2 * 5.0**0.5)
     throttle = 1.0 - (speed / target) ** 10
     throttle = throttle - jnp.where(has_front, (wanted / jnp.maximum(distance, 0.1)) ** 2, 0.0)
     throttle = jnp.clip(throttle, -1.0, 1.0)
@@ -243,5 +243,5 @@ def advance(
         lateral=lateral + slide * CONTROL_STEP,
         slide=slide,
         speed=new_speed,
-        waited=jnp.where(move != 0, CALM, traffic.waited + driving),
+        waited=jnp.where(move != 0, CALM, traffic.waited + driving.astype(jnp.int32)),
     )

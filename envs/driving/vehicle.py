@@ -164,7 +164,7 @@ def drive(
         body = body + SUBSTEP * jnp.append(velocity, yaw_rate)
         return _Moving(body, velocity, yaw_rate, acceleration=du / SUBSTEP)
 
-    start = _Moving(ego.body, ego.velocity, ego.yaw_rate, acceleration=jnp.zeros(()))
+    start = _Moving(ego.body, ego.velocity, ego.yaw_rate, acceleration=jnp.zeros((), jnp.float32))
     # a loop is half the compile time of the substeps written out; an accelerator has them so
     loop = functools.partial(jax.lax.fori_loop, unroll=jax.default_backend() != "cpu")
     late = loop(0, REPORT_AFTER, substep, start)

@@ -188,7 +188,8 @@ def _grip_site(env: Any, states: Any) -> tuple[np.ndarray, np.ndarray]:
 
     def one(joints: jax.Array, speeds: jax.Array) -> tuple[jax.Array, jax.Array]:
         at = frames(list(joints - TIMESTEP * speeds), tool)
-        return jnp.stack(at.position) + jnp.array(base), unrolled_linalg.array(at.rotation).T
+        place = jnp.stack(at.position) + jnp.array(base, jnp.float32)
+        return place, unrolled_linalg.array(at.rotation).T
 
     places, turns = jax.jit(jax.vmap(one))(states.joints, states.speeds)
     return np.asarray(places), np.asarray(turns)

@@ -107,7 +107,7 @@ def draw_factors(ranges: Ranges | None, number: jax.Array) -> Factors:
             )
         ]
     )
-    share = jax.random.uniform(_key(number), (len(Factors._fields),), minval=-1.0)
+    share = jax.random.uniform(_key(number), (len(Factors._fields),), jnp.float32, minval=-1.0)
     friction, mass, damping, gain = jnp.exp(share * jnp.log1p(widths))
     return Factors(friction=friction, mass=mass, damping=damping, gain=gain)
 
@@ -116,7 +116,7 @@ def start_offset(ranges: Ranges | None, number: jax.Array, size: int) -> jax.Arr
     """What scenario `number` adds to the joints at its start, [size] rad; 0 without ranges."""
     if ranges is None:
         return 0.0
-    noise = jax.random.normal(jax.random.fold_in(_key(number), 1), (size,))
+    noise = jax.random.normal(jax.random.fold_in(_key(number), 1), (size,), jnp.float32)
     return jnp.asarray(ranges.start_noise, jnp.float32) * noise
 
 
@@ -139,5 +139,5 @@ def sensed(
     if ranges is None:
         return observation
     key = jax.random.fold_in(jax.random.fold_in(_key(number), 2), time)
-    noise = jax.random.normal(key, observation.shape) * jnp.asarray(scale, jnp.float32)
+    noise = jax.random.normal(key, observation.shape, jnp.float32) * jnp.asarray(scale, jnp.float32)
     return observation + jnp.asarray(ranges.sensor_noise, jnp.float32) * noise

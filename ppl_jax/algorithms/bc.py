@@ -9,7 +9,6 @@ from typing import Any
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 
 from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm
@@ -45,7 +44,7 @@ class ClonerState:
 
 def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> ClonerState:
     """Before the first step."""
-    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    item = spec.zeros()
     rows = config.human_rows
     return ClonerState(
         learned=init_learned(policy.init(key)), human_buffer=buffers.init_buffer(item, rows)

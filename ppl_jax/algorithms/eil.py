@@ -111,7 +111,7 @@ def judge(
     A step is judged once W more have gone by, its episode has ended, or the expert has taken over.
     """
     window = waiting.action.shape[0]
-    rows = jnp.arange(window + 1)
+    rows = jnp.arange(window + 1, dtype=jnp.int32)
     filled = (rows >= window - waiting.count) & (rows < window)
     done = step.terminated | step.truncated
     novice = ~step.takeover
@@ -171,7 +171,7 @@ def hinge_losses(
 def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig) -> EILState:
     """Before the first step."""
     key_actor, key_critic = jax.random.split(key)
-    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    observation, action = spec.zeros()
     rows, window = config.human_rows, config.decision_interval
     labelled = LabelledSteps(observation=observation, action=action, good=jnp.zeros((), bool))
     return EILState(
@@ -182,8 +182,8 @@ def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainC
         human_buffer=buffers.init_buffer((observation, action, action), rows),
         robot_buffer=buffers.init_buffer(labelled, rows),
         waiting=PendingSteps(
-            observation=jnp.zeros((window, spec.observation_size)),
-            action=jnp.zeros((window, spec.action_size)),
+            observation=jnp.zeros((window, spec.observation_size), jnp.float32),
+            action=jnp.zeros((window, spec.action_size), jnp.float32),
             count=jnp.zeros((), jnp.int32),
         ),
     )
@@ -209,7 +209,9 @@ def sample_batch(
     key_human, key_robot, key_others = jax.random.split(key, 3)
     observation, action, novices = buffers.sample(state.human_buffer, key_human, half, recency)
     labelled = buffers.sample(state.robot_buffer, key_robot, half, recency)
-    random = jax.random.uniform(key_others, (OTHERS, *action.shape), minval=-1.0, maxval=1.0)
+    random = jax.random.uniform(
+        key_others, (OTHERS, *action.shape), jnp.float32, minval=-1.0, maxval=1.0
+    )
     return Batch(
         observation=observation,
         expert_action=action,
@@ -249,7 +251,9 @@ def actor_loss(
     """L_mu of a batch; `critics` are the parameters of the values."""
     half = batch.expert_action.shape[0]
     observation = jnp.concatenate([batch.observation, batch.labelled.observation])
-    weight = jnp.concatenate([jnp.ones(half), batch.weight * jnp.ones(half)])
+    weight = jnp.concatenate(
+        [jnp.ones(half, jnp.float32), batch.weight * jnp.ones(half, jnp.float32)]
+    )
     action = networks.policy.apply(params, observation)
     value = networks.critic.apply(critics, observation, action)[0]
     cloned = jnp.mean(likelihood.log_prob(action[:half], batch.expert_action))

@@ -76,7 +76,7 @@ class EnsembleState:
 
 def init_bootstrap(key: jax.Array, spec: EnvSpec, config: TrainConfig) -> Bootstrap:
     """Empty data sets; which row goes to which member how often is drawn beforehand."""
-    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    item = spec.zeros()
     rows = config.human_rows
     copies = jax.random.poisson(key, 1.0, (rows, config.method.members)).astype(jnp.float32)
     return Bootstrap(buffer=buffers.init_buffer(item, rows), copies=copies)

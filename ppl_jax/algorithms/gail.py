@@ -123,11 +123,11 @@ def imitation_reward(logit: jax.Array, correction: jax.Array | float) -> jax.Arr
 def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig) -> GAILState:
     """Before the first step."""
     key_policy, key_value, key_disc = jax.random.split(key, 3)
-    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    observation, action = spec.zeros()
     no = jnp.zeros((), bool)
     start = {
         "mean": networks.policy.init(key_policy),
-        "log_std": jnp.full(spec.action_size, INITIAL_LOG_STD),
+        "log_std": jnp.full(spec.action_size, INITIAL_LOG_STD, jnp.float32),
     }
     step = OnPolicyStep(
         observation=observation,
@@ -151,7 +151,7 @@ def act(state: GAILState, key: jax.Array, observation: jax.Array, networks: Netw
     """An action of the Gaussian policy."""
     params = state.learned.policy.params
     mean = networks.policy.apply(params["mean"], observation)
-    return mean + jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
+    return mean + jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape, jnp.float32)
 
 
 def store(state: GAILState, step: Interaction, hparams: HParams) -> GAILState:

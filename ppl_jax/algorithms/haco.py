@@ -122,7 +122,7 @@ def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainC
         actor=init_learned(networks.actor.init(key_actor)),
         value=init_learned(networks.critic.init(key_value)),
         cost=init_learned(networks.critic.init(key_cost)),
-        log_alpha=init_learned(jnp.zeros(())),
+        log_alpha=init_learned(jnp.zeros((), jnp.float32)),
     )
     return HACOState(learned=learned, replay=init_replay(spec, config))
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 
 from ppl_jax import buffers
 from ppl_jax.algorithms.base import Algorithm
@@ -35,7 +34,7 @@ class IWRState:
 
 def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> IWRState:
     """Before the first step."""
-    item = (jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size))
+    item = spec.zeros()
     rows = config.human_rows
     return IWRState(
         learned=init_learned(policy.init(key)), steps=buffers.init_split(item, rows, rows)

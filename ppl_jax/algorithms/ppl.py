@@ -175,7 +175,7 @@ class PPLState:
 def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfig) -> PPLState:
     """Before the first step."""
     method, actions = config.method, None
-    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    observation, action = spec.zeros()
     pair = PreferenceBatch(
         observation=observation,
         preferred_action=action,
@@ -184,7 +184,9 @@ def init_state(key: jax.Array, policy: Novice, spec: EnvSpec, config: TrainConfi
     )
     if "random" in (method.preferred, method.rejected):
         shape = (2, method.preference_capacity, spec.action_size)
-        actions = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0, maxval=1.0)
+        actions = jax.random.uniform(
+            jax.random.fold_in(key, 1), shape, jnp.float32, minval=-1.0, maxval=1.0
+        )
     measured = horizon.init_horizon(method.max_preference_horizon)
     return PPLState(
         learned=init_learned(policy.init(key)),

@@ -111,7 +111,7 @@ def smoothed_target(
     networks: Networks,
 ) -> jax.Array:
     """TD3's target (Fujimoto et al. 2018): the target policy's action with clipped noise, [B]."""
-    noise = TARGET_NOISE * jax.random.normal(key, batch.executed_action.shape)
+    noise = TARGET_NOISE * jax.random.normal(key, batch.executed_action.shape, jnp.float32)
     following = networks.policy.apply(learned.actor.average, batch.next_observation)
     following = following + jnp.clip(noise, -NOISE_CLIP, NOISE_CLIP)
     values = networks.critic.apply(

@@ -64,7 +64,7 @@ def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array
 
 def init_replay(spec: EnvSpec, config: TrainConfig) -> SplitBuffer:
     """Empty buffers of the expert's and the novice's steps."""
-    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    observation, action = spec.zeros()
     no = jnp.zeros((), bool)
     item = ReplayStep(
         observation=observation,

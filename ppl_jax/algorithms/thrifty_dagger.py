@@ -111,7 +111,7 @@ class ThriftyState:
 def quantile(buffer: RingBuffer, values: jax.Array, share: jax.Array | float) -> jax.Array:
     """Quantile over the filled rows of one of a buffer's arrays, [C] -> []."""
     held = buffers.size(buffer)
-    filled = jnp.where(jnp.arange(values.shape[0]) < held, values, jnp.inf)
+    filled = jnp.where(jnp.arange(values.shape[0], dtype=jnp.int32) < held, values, jnp.inf)
     row = jnp.floor(share * (held - 1)).astype(jnp.int32)
     return jnp.sort(filled)[jnp.clip(row, 0, values.shape[0] - 1)]
 
@@ -139,7 +139,7 @@ def init_state(
 ) -> ThriftyState:
     """Before the first step."""
     key_params, key_risk, key_data = jax.random.split(key, 3)
-    observation, action = jnp.zeros(spec.observation_size), jnp.zeros(spec.action_size)
+    observation, action = spec.zeros()
     no = jnp.zeros((), bool)
     item = RiskStep(
         observation=observation,
@@ -152,12 +152,14 @@ def init_state(
         learned=ThriftyLearned(
             policies=init_learned(networks.ensemble.init(key_params)),
             risk=init_learned(networks.critic.init(key_risk)),
-            discrepancy=jnp.zeros(()),
+            discrepancy=jnp.zeros((), jnp.float32),
         ),
         human=init_bootstrap(key_data, spec, config),
         steps=buffers.init_buffer(item, config.human_rows),
         goals=buffers.init_buffer(item, GOALS),
-        recent=buffers.init_buffer((jnp.zeros(()), jnp.zeros(())), RECENT),
+        recent=buffers.init_buffer(
+            (jnp.zeros((), jnp.float32), jnp.zeros((), jnp.float32)), RECENT
+        ),
     )
 
 
@@ -169,7 +171,7 @@ def decide(
     held = buffers.size(recent)
     doubts, safeties = recent.data
     shown = state.human.buffer
-    rows = jnp.arange(SAMPLE) % jnp.maximum(buffers.size(shown), 1)
+    rows = jnp.arange(SAMPLE, dtype=jnp.int32) % jnp.maximum(buffers.size(shown), 1)
     at_first = jnp.quantile(
         ensemble_variance(networks.ensemble, policies, shown.data[0][rows]),
         1.0 - hparams.method.switch_rate,
@@ -218,7 +220,9 @@ def sample_steps(state: ThriftyState, key: jax.Array, key_goals: jax.Array, coun
     """A batch [count] with a share of steps that solved the task, once there are any."""
     batch = buffers.sample(state.steps, key, count)
     goals = buffers.sample(state.goals, key_goals, count)
-    is_goal = (jnp.arange(count) < GOAL_SHARE * count) & (buffers.size(state.goals) > 0)
+    is_goal = (jnp.arange(count, dtype=jnp.int32) < GOAL_SHARE * count) & (
+        buffers.size(state.goals) > 0
+    )
     return jax.tree.map(
         lambda goal, step: jnp.where(is_goal.reshape(-1, *[1] * (goal.ndim - 1)), goal, step),
         goals,

@@ -57,7 +57,9 @@ def show(at: Round, learner: PPOLearner, _: None) -> Any:
     own = problem.policy.apply(at.cloned.average["mean"], scaled(problem, at.inputs, observation))
     chex.assert_equal_shape([shown, own])
     action = jnp.where(at.number == 0, shown, own)
-    noise = learner.hparams.demonstration_noise * jax.random.normal(key_noise, action.shape)
+    noise = learner.hparams.demonstration_noise * jax.random.normal(
+        key_noise, action.shape, jnp.float32
+    )
     learner = dataclasses.replace(learner, key=key)
     learner, row = step_envs(problem, key_step, learner, action + noise)
     apart = jnp.sum(jnp.abs(jnp.clip(own, -1.0, 1.0) - shown), -1)
@@ -99,14 +101,15 @@ def one_round(problem: Problem, carry: Any, number: jax.Array) -> Any:
 
     def update(learned: Learned, at: Any) -> tuple[Learned, jax.Array]:
         key, progress = at
-        chosen = jax.random.randint(key, (CLONING_BATCH,), 0, count)
+        chosen = jax.random.randint(key, (CLONING_BATCH,), 0, count, jnp.int32)
         seen, action = scaled(problem, inputs, kept[0][chosen]), kept[1][chosen]
         value, grads = jax.value_and_grad(cloning_loss)(learned.params, problem, seen, action)
         return adam_step(learned, grads, CLONING_RATE * (1.0 - progress)), value
 
     key, key_updates = jax.random.split(learner.key)
     learner = dataclasses.replace(learner, key=key)
-    progress = (number + jnp.arange(updates) / max(updates, 1)) / config.demonstration_rounds
+    share = jnp.arange(updates, dtype=jnp.float32) / max(updates, 1)
+    progress = (number + share) / config.demonstration_rounds
     each = (jax.random.split(key_updates, updates), progress)
     cloned, losses = jax.lax.scan(update, cloned, each)
     return (learner, cloned, inputs, kept), {
@@ -120,9 +123,14 @@ def clone(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Metrics]:
     config, spec = problem.config, problem.env.spec
     rounds = config.demonstration_rounds
     total = rounds * length_of_round(problem) * config.num_envs
-    kept = [jnp.zeros((total, width)) for width in (spec.observation_size, spec.action_size)]
+    kept = [
+        jnp.zeros((total, width), jnp.float32)
+        for width in (spec.observation_size, spec.action_size)
+    ]
     carry = (learner, learner.learned.policy, learner.learned.inputs, kept)
-    carry, metrics = jax.lax.scan(functools.partial(one_round, problem), carry, jnp.arange(rounds))
+    carry, metrics = jax.lax.scan(
+        functools.partial(one_round, problem), carry, jnp.arange(rounds, dtype=jnp.int32)
+    )
     learner, cloned, inputs, _ = carry
     start = init_learned(cloned.average)  # PPO's Adam starts anew
     learned = dataclasses.replace(learner.learned, policy=start, inputs=inputs)

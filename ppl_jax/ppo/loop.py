@@ -265,10 +265,10 @@ def minibatch(update: Update, carry: Any, at: jax.Array) -> Any:
         log_std = jnp.minimum(actor.params["log_std"], update.most_log_std)
         log_std = jnp.maximum(log_std, jnp.log(hparams.min_std))
         moved = actor.params | {"log_std": log_std}
-        return dataclasses.replace(actor, params=moved), (away, jnp.ones(()))
+        return dataclasses.replace(actor, params=moved), (away, jnp.ones((), jnp.float32))
 
     def stay(actor: Learned) -> tuple[Learned, tuple[jax.Array, jax.Array]]:
-        return actor, (jnp.zeros(()), jnp.zeros(()))
+        return actor, (jnp.zeros((), jnp.float32), jnp.zeros((), jnp.float32))
 
     actor, moved = jax.lax.cond(stop, stay, move, actor)
     errors = functools.partial(critic_loss, problem=update.problem)

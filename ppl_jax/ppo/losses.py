@@ -116,7 +116,8 @@ class RunningStats:
 
 def init_running_stats(shape: tuple[int, ...]) -> RunningStats:
     """Empty running statistics."""
-    return RunningStats(count=jnp.zeros(()), mean=jnp.zeros(shape), square=jnp.zeros(shape))
+    zero = jnp.zeros(shape, jnp.float32)
+    return RunningStats(count=jnp.zeros((), jnp.float32), mean=zero, square=zero)
 
 
 @flax.struct.dataclass

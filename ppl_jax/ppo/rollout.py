@@ -144,7 +144,8 @@ class Rollout:
 
 def start_envs(problem: Problem, key: jax.Array) -> dict[str, Any]:
     """Fresh environments with their observations and empty episode sums."""
-    keys, zero = jax.random.split(key, problem.config.num_envs), jnp.zeros(problem.config.num_envs)
+    count = problem.config.num_envs
+    keys, zero = jax.random.split(key, count), jnp.zeros(count, jnp.float32)
     observation, env_state = jax.vmap(problem.env.reset, in_axes=(0, None))(keys, problem.params)
     played = Played(reward=zero, cost=zero, length=zero)
     return {"observation": observation, "env_state": env_state, "played": played}
@@ -213,7 +214,7 @@ def rollout(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Rollout]
         key, key_act, key_step = jax.random.split(learner.key, 3)
         observation, before = learner.observation, learner.env_state
         mean = problem.policy.apply(network["mean"], scaled(problem, inputs, observation))
-        noise = jax.random.normal(key_act, mean.shape)
+        noise = jax.random.normal(key_act, mean.shape, jnp.float32)
         action = mean + jnp.exp(network["log_std"]) * noise
         learner, row = step_envs(problem, key_step, dataclasses.replace(learner, key=key), action)
         reward, terminated, done, info, played = row

@@ -44,7 +44,8 @@ class NutMjx:
     def bodies(self, state: NutState) -> Bodies:
         """MuJoCo's state of a task's state."""
         model, turn = self.scene.model, rotation_matrix(state.quaternion)
-        qpos, qvel, warm = jnp.zeros(model.nq), jnp.zeros(model.nv), jnp.zeros(model.nv)
+        qpos = jnp.zeros(model.nq, jnp.float32)
+        qvel = warm = jnp.zeros(model.nv, jnp.float32)
         last = state.acceleration
         ring = jnp.concatenate([state.position, state.quaternion])
         qpos = qpos.at[self.arm.qpos].set(state.joints).at[self.ring_at].set(ring)

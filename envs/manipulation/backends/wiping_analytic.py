@@ -48,7 +48,7 @@ class WipingAnalytic:
             speeds = speeds + TIMESTEP * touch.acceleration
             return (joints + TIMESTEP * speeds, speeds, touch.acceleration, touch.force), None
 
-        carry = (state.joints, state.speeds, state.acceleration, jnp.zeros(3))
+        carry = (state.joints, state.speeds, state.acceleration, jnp.zeros(3, jnp.float32))
         joints, speeds, acceleration, force = jax.lax.scan(step, carry, None, length=SUBSTEPS)[0]
         return Moved(
             joints=joints,

@@ -39,7 +39,9 @@ class WipingMujocoC:
             moved, touched = scene.step(carry[0], applied, factors=factors)
             return (moved, touched.force[0]), None
 
-        (moved, push), _ = jax.lax.scan(step, (start, jnp.zeros(3)), None, length=SUBSTEPS)
+        (moved, push), _ = jax.lax.scan(
+            step, (start, jnp.zeros(3, jnp.float32)), None, length=SUBSTEPS
+        )
         return Moved(
             joints=moved.qpos,
             speeds=moved.qvel,

@@ -72,9 +72,9 @@ class TwoFingerGripper:
         return Fingers(
             inner=jnp.asarray(gripper.INITIAL[1::3], jnp.float32),
             outer=jnp.asarray(gripper.INITIAL[2::3], jnp.float32),
-            inner_speed=jnp.zeros(2),
-            outer_speed=jnp.zeros(2),
-            command=jnp.zeros(()),
+            inner_speed=jnp.zeros(2, jnp.float32),
+            outer_speed=jnp.zeros(2, jnp.float32),
+            command=jnp.zeros((), jnp.float32),
             touching=jnp.zeros(2, bool),
         )
 

@@ -291,7 +291,7 @@ def free_motion(
     air = joint_torque(columns, *drag(tool, at.rotation, (linear, angular)))
     net = []
     for index in range(6):
-        limit = TORQUE_LIMIT[index]
+        limit = float(TORQUE_LIMIT[index])
         applied = jnp.clip(task[index] + weight[index], -limit, limit) - weight[index]
         brake = joint_brake(speeds[index], DAMPING, FRICTION_LOSS)
         net.append(applied + air[index] - factors.damping * brake)

@@ -40,8 +40,8 @@ def scripted_expert(
     ahead = jnp.arctan2(sides[1, 0], sides[0, 0]) - jnp.arctan2(axes[0, 1], axes[0, 0])
     quarter = jnp.pi / 2
     yaw = (ahead + quarter / 2) % quarter - quarter / 2
-    tilt = jnp.cross(axes[2], jnp.array([0.0, 0.0, -1.0]))
-    turn = jnp.clip(TURN * jnp.array([tilt[0], tilt[1], yaw]), -1.0, 1.0)
+    tilt = jnp.cross(axes[2], jnp.array([0.0, 0.0, -1.0], jnp.float32))
+    turn = jnp.clip(TURN * jnp.array([tilt[0], tilt[1], yaw], jnp.float32), -1.0, 1.0)
 
     # height over the cube is a funnel: the better in line, the lower
     off = cube.position - eef
@@ -52,7 +52,7 @@ def scripted_expert(
     level = LEVEL[0] + (LEVEL[1] - LEVEL[0]) * _ramp(command, -1.0, 0.0)
     around = (wrong < LOST) & (jnp.abs(off[2]) < level)
 
-    lift = jnp.array([0.0, 0.0, RISE]) * _ramp(command, *TIGHT)
+    lift = jnp.array([0.0, 0.0, RISE], jnp.float32) * _ramp(command, *TIGHT)
     move = jnp.clip(GAIN * jnp.where(cube.grasped, lift, reach), -1.0, 1.0)
     move = move.at[2].set(jnp.clip(move[2], -0.5, jnp.where(cube.grasped, UPWARDS, 1.0)))
     turn = jnp.where(cube.grasped, 0.5 * turn.at[2].set(0.0), turn)

@@ -56,12 +56,12 @@ def scripted_expert(
 
     # the gripper closes along its x axis, which should lie along the handle's y axis, either way
     across = ring[:, 1] * jnp.where(jnp.sum(ring[:, 1] * axes[0]) < 0, -1.0, 1.0)
-    flat = across * jnp.array([1.0, 1.0, 0.0])
+    flat = across * jnp.array([1.0, 1.0, 0.0], jnp.float32)
     flat = flat / jnp.sqrt(jnp.sum(flat**2) + 1e-9)
     yaw = jnp.arctan2(axes[0, 0] * flat[1] - axes[0, 1] * flat[0], axes[0, :2] @ flat[:2])
-    down = jnp.array([0.0, 0.0, -1.0])
+    down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
     tilt = jnp.cross(axes[2], down)
-    turn = jnp.clip(TURN * jnp.array([tilt[0], tilt[1], yaw]), -1.0, 1.0)
+    turn = jnp.clip(TURN * jnp.array([tilt[0], tilt[1], yaw], jnp.float32), -1.0, 1.0)
 
     # height over the handle is a funnel: the better in line, the lower
     off = handle - eef
@@ -73,7 +73,7 @@ def scripted_expert(
     around = (wrong < LOST) & (jnp.abs(off[2]) < level)
 
     # and so is height over the peg
-    peg = jnp.array(PEG[:2]) - position[:2]
+    peg = jnp.array(PEG[:2], jnp.float32) - position[:2]
     beside = jnp.sqrt(jnp.sum(peg**2) + 1e-12)
     height = LOWER + (CARRY - LOWER) * _ramp(beside, OVER, OFF)
     free = jnp.maximum(_ramp(position[2], *LIFTED), 1 - _ramp(beside, 2 * OFF, 3 * OFF))

@@ -36,7 +36,7 @@ NEAR, CLUSTER = 0.05, 0.02  # m
 def _circle(away: jax.Array, radius: jax.Array) -> jax.Array:
     """Velocity command, [2], at `away` [2] from the centroid of dirt of that radius."""
     distance = jnp.sqrt(jnp.sum(away**2) + 1e-8)
-    out = away + jnp.array([0.0, 0.01])  # at the centre, some way out
+    out = away + jnp.array([0.0, 0.01], jnp.float32)  # at the centre, some way out
     out = out / jnp.sqrt(jnp.sum(out**2) + 1e-8)
     along = jnp.stack([-out[1], out[0]])
     wanted = jnp.maximum(radius - INSIDE, 0.0)
@@ -63,7 +63,7 @@ def scripted_expert(
     near = jnp.sum((state.markers - state.markers[closest]) ** 2, -1) < CLUSTER**2
     around = left & near
     target = jnp.sum(jnp.where(around[:, None], state.markers, 0.0), 0)
-    error = target / jnp.maximum(jnp.sum(around), 1) - place
+    error = target / jnp.maximum(jnp.sum(around, dtype=jnp.float32), 1.0) - place
     looking = (state.time >= PATIENCE) & (distance[closest] < NEAR)
     command = jnp.where(looking, jnp.clip(GAIN * error, -1.0, 1.0), command)
 

@@ -18,7 +18,7 @@ SUBSTEPS = 25  # per control step of 0.05 s
 
 INITIAL_JOINTS = np.array([-0.470, -1.735, 2.480, -2.275, -1.590, -1.991])
 INITIAL_NOISE = 0.02  # rad, standard deviation per joint
-JOINT_LIMIT = np.array([6.28319, 6.28319, 3.14159, 6.28319, 6.28319, 6.28319])
+JOINT_LIMIT = np.array([6.28319, 6.28319, 3.14159, 6.28319, 6.28319, 6.28319], np.float32)
 TORQUE_LIMIT = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
 FRICTION_LOSS = 0.01  # N m, every arm joint
 PAD_SPHERE = 0.001  # m, radius of the spheres that stand for points of a gripper's pad

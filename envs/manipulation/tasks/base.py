@@ -21,7 +21,7 @@ from envs.manipulation.randomisation import (
     sensed,
     start_offset,
 )
-from envs.manipulation.scenes.model import TIMESTEP, Tool
+from envs.manipulation.scenes.model import INITIAL_JOINTS, INITIAL_NOISE, TIMESTEP, Tool
 from ppl_jax.types import Expert
 
 TRAINING_SCENARIOS = range(1000)
@@ -131,6 +131,12 @@ class ArmTask(Environment):
         """Velocity of the grip site, [3] m/s."""
         at = lagged_frames(state, self.tool)
         return jnp.stack(twist_of(jacobian(at), list(state.speeds))[0])
+
+
+def first_pose(key: jax.Array) -> jax.Array:
+    """The pose at a start, robosuite's with its noise, [6] rad."""
+    noise = INITIAL_NOISE * jax.random.normal(key, (6,), jnp.float32)
+    return jnp.asarray(INITIAL_JOINTS, jnp.float32) + noise
 
 
 def lagged_frames(state: Any, tool: Tool) -> Frames:

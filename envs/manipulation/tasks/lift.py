@@ -20,9 +20,8 @@ from envs.manipulation.scenes.lift import CUBE_HALF, TABLE, lift_scene
 from envs.manipulation.scenes.model import (
     GRIPPER,
     INITIAL_JOINTS,
-    INITIAL_NOISE,
 )
-from envs.manipulation.tasks.base import HELD_OUT_SCENARIOS, TRAINING_SCENARIOS
+from envs.manipulation.tasks.base import HELD_OUT_SCENARIOS, TRAINING_SCENARIOS, first_pose
 from envs.manipulation.tasks.scene_task import SceneState, SceneTask, Start, Verdict
 from ppl_jax.types import Expert
 
@@ -130,15 +129,15 @@ class Lift(SceneTask):
     def draw(self, key: jax.Array) -> Start:
         """Joints about robosuite's pose; the cube about the table's centre, turned any way."""
         key_joints, key_cube = jax.random.split(key)
-        joints = INITIAL_JOINTS + INITIAL_NOISE * jax.random.normal(key_joints, (6,))
-        x, y, half_yaw = jax.random.uniform(key_cube, (3,), minval=-1.0) * jnp.array(
-            [PLACE, PLACE, jnp.pi / 2]
+        joints = first_pose(key_joints)
+        x, y, half_yaw = jax.random.uniform(key_cube, (3,), jnp.float32, minval=-1.0) * jnp.array(
+            [PLACE, PLACE, jnp.pi / 2], jnp.float32
         )
         cube = jnp.stack(
             [x, y, jnp.float32(TABLE[2] + CUBE_HALF + DROP), jnp.cos(half_yaw), 0.0, 0.0,
              jnp.sin(half_yaw)]
         )  # fmt: skip
-        qpos = jnp.zeros(self.scene.model.nq).at[self.arm.qpos].set(joints)
+        qpos = jnp.zeros(self.scene.model.nq, jnp.float32).at[self.arm.qpos].set(joints)
         return Start(qpos.at[self.cube_at].set(cube))
 
     def sense(self, data: Any) -> Cube:

@@ -21,10 +21,10 @@ def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
         key: Random key.
         half: Half sizes of the table, m.
     """
-    limit = jnp.array([COVERAGE * size - LINE_WIDTH / 2 for size in half])
+    limit = jnp.array([COVERAGE * size - LINE_WIDTH / 2 for size in half], jnp.float32)
     key_place, key_heading, key_walk = jax.random.split(key, 3)
-    place = jax.random.uniform(key_place, (2,), minval=-limit, maxval=limit)
-    heading = jax.random.uniform(key_heading, minval=-jnp.pi, maxval=jnp.pi)
+    place = jax.random.uniform(key_place, (2,), jnp.float32, minval=-limit, maxval=limit)
+    heading = jax.random.uniform(key_heading, minval=-jnp.pi, maxval=jnp.pi, dtype=jnp.float32)
 
     def ahead(place: jax.Array, heading: jax.Array) -> jax.Array:
         return place + SPACING * jnp.stack([jnp.sin(heading), jnp.cos(heading)])
@@ -32,8 +32,10 @@ def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
     def step(carry, key):
         place, heading = carry
         key_chance, key_turn, key_border = jax.random.split(key, 3)
-        turned = heading + TURN * jax.random.normal(key_turn)
-        heading = jnp.where(jax.random.uniform(key_chance) < TURN_CHANCE, turned, heading)
+        turned = heading + TURN * jax.random.normal(key_turn, dtype=jnp.float32)
+        heading = jnp.where(
+            jax.random.uniform(key_chance, dtype=jnp.float32) < TURN_CHANCE, turned, heading
+        )
 
         def outside(carry) -> jax.Array:
             return ~jnp.all(jnp.abs(ahead(place, carry[0])) < limit)
@@ -41,7 +43,7 @@ def draw_markers(key: jax.Array, half: tuple[float, float]) -> jax.Array:
         def turn(carry):
             heading, key = carry
             key, key_now = jax.random.split(key)
-            return heading + TURN * jax.random.normal(key_now), key
+            return heading + TURN * jax.random.normal(key_now, dtype=jnp.float32), key
 
         heading, _ = jax.lax.while_loop(outside, turn, (heading, key_border))
         return (ahead(place, heading), heading), place

@@ -23,13 +23,12 @@ from envs.manipulation.scenes.model import (
     GRIPPER,
     HANDLE,
     INITIAL_JOINTS,
-    INITIAL_NOISE,
     NUT_BASE,
     PEG,
     TIMESTEP,
 )
-from envs.manipulation.tasks.base import ArmTask, lagged_frames
-from ppl_jax.types import Array, EnvSpec, Outcome
+from envs.manipulation.tasks.base import ArmTask, first_pose, lagged_frames
+from ppl_jax.types import EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 51, 7
 HORIZON = 1000  # control steps of 0.05 s
@@ -104,7 +103,7 @@ def lagged_ring(state: NutState) -> tuple[jax.Array, jax.Array]:
 
 def handle_of(position: jax.Array, quaternion: jax.Array) -> jax.Array:
     """Centre of the handle, [3]."""
-    return position + rotation_matrix(quaternion) @ jnp.array(HANDLE)
+    return position + rotation_matrix(quaternion) @ jnp.array(HANDLE, jnp.float32)
 
 
 def stages(
@@ -128,7 +127,7 @@ def stages(
     reach = REACH * (1 - jnp.tanh(10 * jnp.linalg.norm(eef - handle)))
     missing = jnp.where(time <= DISTRACTED, 0.0, jnp.maximum(LIFT_HEIGHT - position[2], 0.0))
     lift = jnp.where(touching, GRASP + (LIFT - GRASP) * (1 - jnp.tanh(15 * missing)), 0.0)
-    away = position[:2] - jnp.array(PEG[:2])
+    away = position[:2] - jnp.array(PEG[:2], jnp.float32)
     hover = lift + (HOVER - LIFT) * (1 - jnp.tanh(10 * jnp.linalg.norm(away)))
     on = jnp.all(jnp.abs(away) < PEG_RANGE) & (position[2] < PEG_HEIGHT)
     return jnp.stack([reach, jnp.where(touching, GRASP, 0.0), lift, hover]), on
@@ -170,20 +169,20 @@ class NutAssembly(ArmTask):
         joints = self.first_joints(params.joints[index], index, params)
         place = params.place[index]
         at = frames(list(joints), GRIPPER)
-        zero = jnp.zeros(())
+        zero = jnp.zeros((), jnp.float32)
         return NutState(
             joints=joints,
-            speeds=jnp.zeros(6),
-            acceleration=jnp.zeros(14),
+            speeds=jnp.zeros(6, jnp.float32),
+            acceleration=jnp.zeros(14, jnp.float32),
             goal_rotation=unrolled_linalg.array(at.rotation),
             fingers=jnp.asarray(gripper.INITIAL, jnp.float32),
-            finger_speeds=jnp.zeros(6),
+            finger_speeds=jnp.zeros(6, jnp.float32),
             command=zero,
             touching=jnp.zeros((), bool),
             position=jnp.append(place[:2], PLACE_Z),
             quaternion=jnp.stack([jnp.cos(place[2] / 2), zero, zero, jnp.sin(place[2] / 2)]),
-            velocity=jnp.zeros(3),
-            spin=jnp.zeros(3),
+            velocity=jnp.zeros(3, jnp.float32),
+            spin=jnp.zeros(3, jnp.float32),
             scenario=jnp.asarray(index, jnp.int32),
             time=jnp.zeros((), jnp.int32),
         )
@@ -277,17 +276,17 @@ class NutAssembly(ArmTask):
 def make_params(numbers: Sequence[int]) -> NutParams:
     """Starts of the scenarios with these numbers."""
 
-    def start(number: jax.Array) -> tuple[Array, jax.Array]:
+    def start(number: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_joints, key_place = jax.random.split(jax.random.key(number))
-        low = jnp.array([PLACE_X[0], PLACE_Y[0], 0.0])
-        high = jnp.array([PLACE_X[1], PLACE_Y[1], 2 * jnp.pi])
-        noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
-        return INITIAL_JOINTS + noise, jax.random.uniform(key_place, (3,), minval=low, maxval=high)
+        low = jnp.array([PLACE_X[0], PLACE_Y[0], 0.0], jnp.float32)
+        high = jnp.array([PLACE_X[1], PLACE_Y[1], 2 * jnp.pi], jnp.float32)
+        place = jax.random.uniform(key_place, (3,), jnp.float32, minval=low, maxval=high)
+        return first_pose(key_joints), place
 
     number = jnp.asarray(tuple(numbers), jnp.int32)
     joints, place = jax.jit(jax.vmap(start))(number)
     return NutParams(
-        joints=joints.astype(jnp.float32),
+        joints=joints,
         place=place,
         number=number,
         reward_scale=jnp.float32(1.0),

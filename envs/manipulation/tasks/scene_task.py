@@ -337,7 +337,7 @@ class SceneTask(ArmTask):
             goal = aimed(data, goal, first)
             return (bodies, fingers, goal, self._site(data), self.sense(data)), None
 
-        begun = Goal(jnp.zeros(3), state.held)
+        begun = Goal(jnp.zeros(3, jnp.float32), state.held)
         carry = (bodies, state.fingers, begun, state.site, state.sensed)
         carry, _ = jax.lax.scan(step, carry, np.arange(scene.substeps) == 0)
         bodies, fingers, goal, site, sensed = carry

@@ -30,16 +30,15 @@ from envs.manipulation.physics.analytic.wipe_contact import (
 from envs.manipulation.randomisation import Ranges
 from envs.manipulation.scenes.model import (
     INITIAL_JOINTS,
-    INITIAL_NOISE,
     JOINT_LIMIT,
     TIMESTEP,
     WIPER,
     WIPING_BASE,
     WIPING_TABLE,
 )
-from envs.manipulation.tasks.base import ArmTask, lagged_frames
+from envs.manipulation.tasks.base import ArmTask, first_pose, lagged_frames
 from envs.manipulation.tasks.markers import COUNT, draw_markers
-from ppl_jax.types import Array, EnvSpec, Outcome
+from ppl_jax.types import EnvSpec, Outcome
 
 OBSERVATION_SIZE, ACTION_SIZE = 34, 6
 HORIZON = 1000  # control steps of 0.05 s
@@ -58,9 +57,11 @@ LIMIT_MARGIN = 0.1  # rad before a joint's limit, where an episode ends
 BASE = np.array(WIPING_BASE, np.float32)
 _CENTRE, _HALF, _TOP = WIPING_TABLE
 _FAR = -10.0  # height of "no table", m
-_SPHERES = np.stack(
-    np.meshgrid([-0.06, -0.04, -0.02, 0.0, 0.02, 0.04, 0.06], [-0.025, 0.025]), -1
-).reshape(-1, 2)
+_SPHERES = (
+    np.stack(np.meshgrid([-0.06, -0.04, -0.02, 0.0, 0.02, 0.04, 0.06], [-0.025, 0.025]), -1)
+    .reshape(-1, 2)
+    .astype(np.float32)
+)
 _SPHERE_RADIUS = 0.001
 _TOOL_ENDS = ((-0.045, 0.0, -0.01), (0.045, 0.0, -0.01))
 
@@ -124,7 +125,7 @@ def contact_count(at: Frames, table: jax.Array) -> jax.Array:
     height = at.position[2] - table
     corners = height + POINTS[:, 0] * x[2] + POINTS[:, 1] * y[2]
     spheres = height - _SPHERE_RADIUS + _SPHERES[:, 0] * x[2] + _SPHERES[:, 1] * y[2]
-    return jnp.sum(corners < 0) + jnp.sum(spheres < 0)
+    return jnp.sum(corners < 0, dtype=jnp.int32) + jnp.sum(spheres < 0, dtype=jnp.int32)
 
 
 def under_face(at: Frames, markers: jax.Array) -> jax.Array:
@@ -144,7 +145,7 @@ def under_face(at: Frames, markers: jax.Array) -> jax.Array:
 def remaining(markers: jax.Array, wiped: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Share wiped; of what is left, the radius about its centroid, and the centroid [3]."""
     left = ~wiped
-    count = jnp.maximum(jnp.sum(left), 1)
+    count = jnp.maximum(jnp.sum(left, dtype=jnp.float32), 1.0)
     centroid = jnp.sum(jnp.where(left[:, None], markers, 0.0), 0) / count
     away = markers - centroid
     radius = jnp.sqrt(jnp.max(jnp.where(left, jnp.sum(away * away, -1), 0.0)))
@@ -239,11 +240,11 @@ class TableWiping(ArmTask):
         at = frames(list(joints), WIPER)
         return WipingState(
             joints=joints,
-            speeds=jnp.zeros(6),
-            acceleration=jnp.zeros(6),
+            speeds=jnp.zeros(6, jnp.float32),
+            acceleration=jnp.zeros(6, jnp.float32),
             goal_rotation=unrolled_linalg.array(at.rotation),
-            force=jnp.zeros(3),
-            force_bias=jnp.zeros(3),
+            force=jnp.zeros(3, jnp.float32),
+            force_bias=jnp.zeros(3, jnp.float32),
             contact=jnp.zeros((), bool),
             markers=params.markers[index],
             wiped=jnp.zeros(COUNT, bool),
@@ -285,7 +286,7 @@ class TableWiping(ArmTask):
         at = lagged_frames(arm, WIPER)
         turn = unrolled_linalg.array(at.rotation)
         heavier = self.factors(state, params).mass
-        weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass]) * heavier
+        weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass], jnp.float32) * heavier
         force = sound(-turn @ (push + weight), state.force)
         contact = jnp.linalg.norm(force - state.force_bias) > CONTACT_FORCE
         over = over_table(jnp.stack(at.position[:2]))
@@ -296,7 +297,7 @@ class TableWiping(ArmTask):
         newly = under_face(at, state.markers - BASE[:2]) & ~state.wiped & (count > 0) & ~unsafe
         wiped = state.wiped | newly
         reward = reward_of(
-            jnp.sum(newly),
+            jnp.sum(newly, dtype=jnp.float32),
             wiped,
             markers=state.markers,
             eef=jnp.stack(at.position) + BASE,
@@ -367,15 +368,15 @@ class TableWiping(ArmTask):
 def make_params(numbers: Sequence[int]) -> WipingParams:
     """Starts of the scenarios with these numbers."""
 
-    def start(number: jax.Array) -> tuple[Array, jax.Array]:
+    def start(number: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_joints, key_markers = jax.random.split(jax.random.key(number))
-        noise = INITIAL_NOISE * jax.random.normal(key_joints, (6,))
-        return INITIAL_JOINTS + noise, draw_markers(key_markers, _HALF) + jnp.array(_CENTRE)
+        markers = draw_markers(key_markers, _HALF) + jnp.array(_CENTRE, jnp.float32)
+        return first_pose(key_joints), markers
 
     number = jnp.asarray(tuple(numbers), jnp.int32)
     joints, markers = jax.jit(jax.vmap(start))(number)
     return WipingParams(
-        joints=joints.astype(jnp.float32),
+        joints=joints,
         markers=markers,
         number=number,
         reward_scale=jnp.float32(NORMALISATION),

@@ -62,18 +62,21 @@ def arm_hits(
         position, columns = at.links[body]
         origin = jnp.stack(position)
         turn = unrolled_linalg.array(columns)  # rows are the axes
-        first.append(origin + jnp.array(a) @ turn)
-        second.append(origin + jnp.array(b) @ turn)
+        first.append(origin + jnp.array(a, jnp.float32) @ turn)
+        second.append(origin + jnp.array(b, jnp.float32) @ turn)
         radius.append(r)
     site = jnp.stack(at.position)
     turn = unrolled_linalg.array(at.rotation)
-    first += [site + jnp.array(tool_ends[0]) @ turn, jnp.array(_MOUNT[0])]
-    second += [site + jnp.array(tool_ends[1]) @ turn, jnp.array(_MOUNT[1])]
+    first += [site + jnp.array(tool_ends[0], jnp.float32) @ turn, jnp.array(_MOUNT[0], jnp.float32)]
+    second += [
+        site + jnp.array(tool_ends[1], jnp.float32) @ turn,
+        jnp.array(_MOUNT[1], jnp.float32),
+    ]
     p, q, r = jnp.stack(first), jnp.stack(second), np.array([*radius, _TOOL_RADIUS, _MOUNT[2]])
     i, j = _PAIRS.T
-    own = _segment_distance(p[i], q[i], p[j], q[j]) < r[i] + r[j]
+    own = _segment_distance(p[i], q[i], p[j], q[j]) < np.float32(r[i] + r[j])
     centre, half, top = table
     ends = jnp.concatenate([p[1:6], q[1:6]])
     reach = np.concatenate([r[1:6], r[1:6]])
-    over = jnp.all(jnp.abs(ends[:, :2] - centre) < half + reach[:, None], -1)
-    return jnp.any(own) | jnp.any(over & (ends[:, 2] - reach < top))
+    over = jnp.all(jnp.abs(ends[:, :2] - centre) < np.float32(half + reach[:, None]), -1)
+    return jnp.any(own) | jnp.any(over & (ends[:, 2] - np.float32(reach) < top))

@@ -124,7 +124,7 @@ def pad_points(
 
 def on_handle(pads: jax.Array, ring: Ring) -> _Points:
     """Pads against the handle's long sides."""
-    local = (pads - ring.position) @ ring.rotation - jnp.array(HANDLE)
+    local = (pads - ring.position) @ ring.rotation - jnp.array(HANDLE, jnp.float32)
     side = jnp.where(local[:, 1] >= 0, 1.0, -1.0)
     gap = jnp.abs(local[:, 1]) - HANDLE_HALF[1]
     reach = (jnp.abs(local[:, 0]) < HANDLE_HALF[0]) & (jnp.abs(local[:, 2]) < HANDLE_HALF[2])
@@ -139,7 +139,7 @@ def on_handle(pads: jax.Array, ring: Ring) -> _Points:
 
 
 def _upward(place: jax.Array) -> _Points:
-    up, east = jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
+    up, east = jnp.array([0.0, 0.0, 1.0], jnp.float32), jnp.array([1.0, 0.0, 0.0], jnp.float32)
     shape = place.shape
     return _Points(
         gap=place[:, 2] - _TABLE,
@@ -191,8 +191,8 @@ def hold(
     origin, axes = hand_axes(motion)
     pads, slopes = pad_points(origin, axes, fingers, inner)
     tips, tip_slopes = pads[_EDGE], slopes[_EDGE]
-    beads = ring.position + BEADS @ ring.rotation.T
-    feet = ring.position + FEET @ ring.rotation.T
+    beads = ring.position + np.float32(BEADS) @ ring.rotation.T
+    feet = ring.position + np.float32(FEET) @ ring.rotation.T
     groups = (on_handle(pads, ring), _upward(tips), _upward(feet), _around_peg(beads))
     gap, place, normal, tangent = (jnp.concatenate(parts) for parts in zip(*groups, strict=True))
     frame = jnp.stack([tangent, jnp.cross(normal, tangent), normal])  # [3, C, 3]
@@ -206,10 +206,10 @@ def hold(
     arm_place = place[:carried] - site
     swept = linear[:, None] + jnp.cross(angular[:, None], arm_place[None])  # [6, F, 3]
     by_arm = jnp.sum(frame[:, :carried, None] * jnp.swapaxes(swept, 0, 1)[None], -1)  # [3, F, 6]
-    left = np.concatenate([np.ones(2 * _ROWS), np.zeros(2 * _ROWS), [1, 1, 0, 0]])
+    left = np.float32([1] * 2 * _ROWS + [0] * 2 * _ROWS + [1, 1, 0, 0])
     by_finger = jnp.sum(frame[:, :carried] * jnp.concatenate([slopes, tip_slopes]), -1)
     by_finger = jnp.stack([by_finger * left, by_finger * (1 - left)], -1)  # [3, F, 2]
-    sign = np.concatenate([-np.ones(_PADS), np.zeros(len(_EDGE)), np.ones(len(FEET) + len(BEADS))])
+    sign = np.repeat(np.float32([-1, 0, 1]), [_PADS, len(_EDGE), len(FEET) + len(BEADS)])
     arms = place - ring.position
     by_ring = jnp.concatenate([frame, jnp.cross(arms[None], frame)], -1) * sign[None, :, None]
     none = np.zeros((3, len(FEET) + len(BEADS), 8), np.float32)
@@ -221,10 +221,9 @@ def hold(
     )
     friction = FRICTION * factors.friction
     speed = jnp.concatenate([jnp.stack(motion.speeds), finger_speeds, ring.velocity, ring.spin])
-    inverse = np.concatenate(
-        [np.full(_PADS, 57.2), np.full(len(_EDGE), 5.7), np.full(len(FEET) + len(BEADS), 51.5)]
-    )
-    weight = jnp.where(gap < 0, IMPEDANCE / ((1 - IMPEDANCE) * inverse), 0.0)
+    inverse = np.repeat([57.2, 5.7, 51.5], [_PADS, len(_EDGE), len(FEET) + len(BEADS)])
+    stiff = np.float32(IMPEDANCE / ((1 - IMPEDANCE) * inverse))
+    weight = jnp.where(gap < 0, stiff, 0.0)
     depth = jnp.maximum(-gap, 0.0)
     rest = DAMP * (rows @ speed)
     rest = rest.at[2].add(-STIFF * IMPEDANCE * depth)
@@ -323,7 +322,7 @@ def _newton(
         return (carry[1] > CONVERGED) & (carry[2] < ITERATIONS)
 
     a = jnp.where(cost(start) < cost(free), start, free)
-    begin = (a, jnp.full((), jnp.inf), jnp.zeros((), jnp.int32))
+    begin = (a, jnp.full((), jnp.inf, jnp.float32), jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(unsettled, improve, begin)[0]
 
 
@@ -342,25 +341,27 @@ def _inertia(
 
     ring_mass = RING_MASS * heavier
     centre = RING_CENTRE * ring.rotation[:, 0]
-    about = (ring.rotation * (RING_INERTIA * heavier)) @ ring.rotation.T
-    about = about + ring_mass * (jnp.sum(centre * centre) * jnp.eye(3) - jnp.outer(centre, centre))
+    about = (ring.rotation * (np.float32(RING_INERTIA) * heavier)) @ ring.rotation.T
+    eye = jnp.eye(3, dtype=jnp.float32)
+    about = about + ring_mass * (jnp.sum(centre * centre) * eye - jnp.outer(centre, centre))
+    zero = jnp.zeros((), jnp.float32)
     skew = ring_mass * jnp.array(
         [
-            [jnp.zeros(()), -centre[2], centre[1]],
-            [centre[2], jnp.zeros(()), -centre[0]],
-            [-centre[1], centre[0], jnp.zeros(())],
-        ]
+            [zero, -centre[2], centre[1]],
+            [centre[2], zero, -centre[0]],
+            [-centre[1], centre[0], zero],
+        ],
+        jnp.float32,
     )
     spin = ring.spin
     whirl = ring_mass * jnp.cross(spin, jnp.cross(spin, centre))
-    weight = ring_mass * jnp.array([0.0, 0.0, -9.81])
+    weight = ring_mass * jnp.array([0.0, 0.0, -9.81], jnp.float32)
     force = weight - whirl - RING_DAMPING * ring.velocity
     torque = jnp.cross(centre, weight) - jnp.cross(spin, about @ spin) - RING_DAMPING * spin
-    own = jnp.block([[ring_mass * jnp.eye(3), -skew], [skew, about]])
+    own = jnp.block([[ring_mass * eye, -skew], [skew, about]])
     ring_free = unrolled_linalg.solve_array(own, jnp.concatenate([force, torque]))
 
-    mass = (
-        jnp.zeros((14, 14)).at[:6, :6].set(unrolled_linalg.array(motion.matrix)).at[8:, 8:].set(own)
-    )
+    mass = jnp.zeros((14, 14), jnp.float32)
+    mass = mass.at[:6, :6].set(unrolled_linalg.array(motion.matrix)).at[8:, 8:].set(own)
     mass = mass.at[6, 6].set(finger_mass).at[7, 7].set(finger_mass)
     return mass, jnp.concatenate([jnp.stack(motion.acceleration), finger_free, ring_free])

@@ -83,7 +83,7 @@ def pad_rows(knuckle: jax.Array, inner: jax.Array) -> tuple[jax.Array, jax.Array
     finger mirrors y.
     """
     turn = knuckle + inner
-    along = TIP + PAD_ROWS
+    along = np.float32(TIP + PAD_ROWS)
     sine, cosine = jnp.sin(knuckle), jnp.cos(knuckle)
     tilt, level = jnp.sin(turn), jnp.cos(turn)
     out_y = FINGER[0] * cosine - FINGER[1] * sine + FACE * level - along * tilt
@@ -132,16 +132,19 @@ def pad_spheres(knuckles: Any, inner: Any) -> jax.Array:
     Args:
         knuckles, inner: [2] rad.
     """
-    along = TIP + PAD_ROWS
+    along = np.float32(TIP + PAD_ROWS)
     sine, cosine = jnp.sin(inner)[:, None], jnp.cos(inner)[:, None]
     y = FINGER[0] + FACE * cosine - along * sine
     z = FINGER[1] + FACE * sine + along * cosine
-    x = np.repeat([-PAD_HALF, PAD_HALF], len(along))
+    x = np.repeat(np.float32([-PAD_HALF, PAD_HALF]), len(along))
     face = jnp.stack(
         [jnp.broadcast_to(x, (2, len(x))), jnp.tile(y + PAD_SPHERE, (1, 2)), jnp.tile(z, (1, 2))],
         -1,
     )
     edge_y = y[:, 0] - PAD_SPHERE * jnp.sin(knuckles)
     edge_z = z[:, 0] - PAD_SPHERE * jnp.cos(knuckles)
-    tips = [jnp.stack([jnp.full(2, sign * PAD_HALF), edge_y, edge_z], -1) for sign in (-1.0, 1.0)]
+    tips = [
+        jnp.stack([jnp.full(2, sign * PAD_HALF, jnp.float32), edge_y, edge_z], -1)
+        for sign in (-1.0, 1.0)
+    ]
     return jnp.concatenate([face, jnp.stack(tips, 1)], 1)

@@ -77,7 +77,7 @@ def sphere_box(sphere: Any, box: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     to_nearest = jnp.clip(centre, -box.size, box.size) - centre
     outside = _length(to_nearest)
     depth = box.size - jnp.abs(centre)
-    face = jnp.arange(3) == jnp.argmin(depth)
+    face = jnp.arange(3, dtype=jnp.int32) == jnp.argmin(depth)
     inwards = jnp.where(face, jnp.where(centre < 0, 1.0, -1.0), 0.0)
     is_outside = outside > _NEXT_TO_NOTHING
     own = jnp.where(is_outside, to_nearest / jnp.maximum(outside, _NEXT_TO_NOTHING), inwards)

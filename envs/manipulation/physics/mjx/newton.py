@@ -230,8 +230,8 @@ def solve(
         a=first,
         origin=first,
         move=jnp.zeros_like(free),
-        steepness=jnp.zeros(()),
-        length=jnp.ones(()),
+        steepness=jnp.zeros((), jnp.float32),
+        length=jnp.ones((), jnp.float32),
         energy=jnp.where(acting, jnp.inf, 0.0),
         turns=jnp.zeros((), jnp.int32),
     )

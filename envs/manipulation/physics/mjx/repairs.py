@@ -71,6 +71,21 @@ def mjx() -> Any:
     return module
 
 
+def in_single(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that calls MJX, traced as without `jax_enable_x64`.
+
+    MJX's own constants have the type that the flag says, so that with it a step would be partly in
+    double precision, and its loops would not trace. All that it is given is in single precision.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: Any, **kwargs: Any) -> Any:
+        with jax.enable_x64(False):
+            return function(*args, **kwargs)
+
+    return traced
+
+
 def _close_forms(math: Any) -> None:
     """Let MJX collide spheres with cylinders and boxes by `closed_forms.py`."""
     driver: Any = importlib.import_module("mujoco.mjx._src.collision_driver")

@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.manipulation.physics.mjx import newton, source, warp
 from envs.manipulation.physics.mjx import rows as constraint_rows
-from envs.manipulation.physics.mjx.repairs import mjx, private
+from envs.manipulation.physics.mjx.repairs import in_single, mjx, private
 from envs.manipulation.physics.mujoco_c import MayClose, import_mujoco
 from envs.manipulation.randomisation import NOMINAL, Factors
 
@@ -62,6 +62,7 @@ class Scene:
         pairs: [C, 2] geoms of each contact of MJX's; None where they have no fixed places.
     """
 
+    @in_single
     def __init__(
         self,
         model: source.Source,
@@ -252,10 +253,12 @@ class Scene:
             mocap = jnp.asarray(mocap, jnp.float32)
         return Bodies(
             qpos=jnp.asarray(model.qpos0 if qpos is None else qpos, jnp.float32),
-            qvel=jnp.zeros(model.nv),
-            warm=jnp.zeros(model.nv),
-            act=jnp.zeros(model.na) if model.na else None,
-            ctrl=(jnp.zeros(model.nu) if ctrl is None else jnp.asarray(ctrl, jnp.float32))
+            qvel=jnp.zeros(model.nv, jnp.float32),
+            warm=jnp.zeros(model.nv, jnp.float32),
+            act=jnp.zeros(model.na, jnp.float32) if model.na else None,
+            ctrl=(
+                jnp.zeros(model.nu, jnp.float32) if ctrl is None else jnp.asarray(ctrl, jnp.float32)
+            )
             if model.nu
             else None,
             mocap=mocap,
@@ -273,6 +276,7 @@ class Scene:
             **{name: value for name, value in given.items() if value is not None},
         )
 
+    @in_single
     def placed(self, bodies: Bodies, put: Any = None) -> Any:
         """MJX's data with the frames of bodies, geoms and sites, and the joints' axes."""
         put = self.put if put is None else put
@@ -290,6 +294,7 @@ class Scene:
             data = data.tree_replace({"_impl.contact.dist": gap})
         return data
 
+    @in_single
     def at_rest(self, bodies: Bodies, put: Any = None) -> Any:
         """MJX's data of a start, as `sense` takes it: frames and contacts; forces are zero."""
         put = self.put if put is None else put
@@ -312,6 +317,7 @@ class Scene:
 
     # ---- physics
 
+    @in_single
     def step(self, data: Any, control: Control, put: Any = None) -> Any:
         """One physics step: MuJoCo's `mj_step1`, the controller, `mj_step2`.
 
