@@ -57,7 +57,7 @@ def add(buffer: RingBuffer, items: PyTree, mask: jax.Array) -> RingBuffer:
     chex.assert_rank(mask, 1)
     chex.assert_tree_shape_prefix(items, mask.shape)
     rows = capacity(buffer)
-    rank = jnp.cumsum(mask) - 1
+    rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
     # rows past the end are dropped: that is where unselected items go
     row = jnp.where(mask, (buffer.next + rank) % rows, rows)
     data = jax.tree.map(lambda old, new: old.at[row].set(new, mode="drop"), buffer.data, items)
@@ -79,7 +79,8 @@ def draw(
         recency: r; 0 draws all alike.
     """
     held = size(buffer)
-    rank = held * jax.random.uniform(key, shape, jnp.float32) ** (1.0 / (1.0 + recency))
+    share = jax.random.uniform(key, shape, jnp.float32) ** (1.0 / (1.0 + recency))
+    rank = held.astype(jnp.float32) * share
     rank = jnp.clip(rank.astype(jnp.int32), 0, jnp.maximum(held - 1, 0))
     return (buffer.next - held + rank) % capacity(buffer)
 
@@ -159,4 +160,4 @@ def sample_both(split: SplitBuffer, key: jax.Array, count: int) -> tuple[PyTree,
         return jnp.where(mask, a[jnp.clip(row, 0, a.shape[0] - 1)], b[theirs])
 
     items = jax.tree.map(pick, split.human.data, split.robot.data)
-    return items, jnp.ones(count, jnp.float32) * (human + robot > 0)
+    return items, jnp.where(human + robot > 0, jnp.ones(count, jnp.float32), 0.0)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ppl_jax.types import Env
+from ppl_jax.types import Env, in_single
 
 Act = Callable[[jax.Array, Any, jax.Array, Any], jax.Array]
 """`act(key, state, observation, params) -> action`."""
@@ -95,12 +95,13 @@ def make_evaluate(
                 states, observations, out = jax.lax.map(one_if, lanes)
             else:
                 states, observations, out = jax.vmap(one)(keys[:, 1], states, actions)
+            out = in_single(out)
             so_far = Episodes(
                 success=so_far.success | (alive & out.success),
-                episodic_return=so_far.episodic_return + alive * out.reward,
-                episodic_cost=so_far.episodic_cost + alive * out.cost,
+                episodic_return=so_far.episodic_return + jnp.where(alive, out.reward, 0.0),
+                episodic_cost=so_far.episodic_cost + jnp.where(alive, out.cost, 0.0),
                 progress=jnp.where(alive, out.progress, so_far.progress),
-                length=so_far.length + alive,
+                length=so_far.length + alive.astype(jnp.int32),
             )
             alive = alive & ~(out.terminated | out.truncated)
             return key, states, observations, alive, so_far, time + 1

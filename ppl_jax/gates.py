@@ -73,8 +73,9 @@ def unsafe_or_slow(point: DecisionPoint, hparams: UnsafeOrSlowHParams, scale: Sc
     """
     del scale
     trajectory = point.trajectory
-    steps = jnp.maximum(jnp.sum(trajectory.valid), 1)
-    mean_speed = jnp.sum(trajectory.speed * trajectory.valid) / steps
+    steps = jnp.maximum(jnp.sum(trajectory.valid, dtype=jnp.int32), 1)
+    total = jnp.sum(jnp.where(trajectory.valid, trajectory.speed, 0.0))
+    mean_speed = total / steps.astype(jnp.float32)
     gain = trajectory.speed[steps - 1] - trajectory.speed[0]
     slow = (mean_speed < hparams.min_speed) & (gain < hparams.min_gain)
     clearance = trajectory.clearance

@@ -148,7 +148,7 @@ def add(horizon: Horizon, measured: Measured, valid: jax.Array) -> Horizon:
     A prediction that has ended stays where it is and reaches no further.
     """
     chex.assert_equal_shape([horizon.count, measured.drift, measured.reach, valid])
-    count = horizon.count + valid
+    count = horizon.count + valid.astype(jnp.float32)
     rate = jnp.where(valid, 1.0 / jnp.clip(count, 1.0, MEMORY), 0.0)
     return Horizon(
         count=count,
@@ -171,8 +171,8 @@ def errors(
 def choose(horizon: Horizon, most: jax.Array | float) -> jax.Array:
     """The L from 1 to `most` whose larger error is least; 1 before anything was seen."""
     worse = jnp.maximum(*errors(horizon.drift, horizon.reach, horizon.apart))
-    allowed = jnp.arange(1, worse.shape[0] + 1, dtype=jnp.int32) <= most
-    return 1.0 + jnp.argmin(jnp.where(allowed, worse, jnp.inf))
+    allowed = jnp.arange(1, worse.shape[0] + 1, dtype=jnp.float32) <= most
+    return 1.0 + jnp.argmin(jnp.where(allowed, worse, jnp.inf)).astype(jnp.float32)
 
 
 class Profile(NamedTuple):
@@ -236,7 +236,7 @@ def watch(
     predicted_transition = predictor(config.predictor).make(env)
     decide = gate(config.gate).decide
     params = env_params(env, env.default_params, hparams)
-    scale = jnp.asarray(env.spec.observation_scale)
+    scale = jnp.asarray(env.spec.observation_scale, jnp.float32)
     most = config.method.max_preference_horizon
 
     def transition(*args: Any) -> Any:
@@ -312,11 +312,13 @@ def summarise(
     begun = valid[:, :1]
 
     def mean(values: jax.Array, of: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(of, values, 0.0), 0) / jnp.maximum(jnp.sum(of, 0), 1)
+        count = jnp.sum(of, 0, dtype=jnp.float32)
+        return jnp.sum(jnp.where(of, values, 0.0), 0) / jnp.maximum(count, 1.0)
 
     # a fixed number of interventions, drawn among those that there are
-    share = begun[:, 0] / jnp.maximum(jnp.sum(begun), 1)
-    some = jnp.where(jnp.sum(begun) > 0, share, 1.0 / share.shape[0])
+    share = begun[:, 0].astype(jnp.float32)
+    total = jnp.sum(share)
+    some = jnp.where(total > 0, share / jnp.maximum(total, 1.0), 1.0 / share.shape[0])
     chosen = jax.random.choice(key_kept, share.shape[0], (kept,), p=some)
     at = jax.random.randint(key_visited, (visited,), 0, share.shape[0], jnp.int32)
     return Profile(
@@ -325,7 +327,7 @@ def summarise(
         reach=mean(measured.reach, begun),
         apart=mean(measured.apart, begun[:, 0]),
         coverage=coverage(seen.observation[at], seen.predicted[chosen], valid[chosen], scale),
-        interventions=jnp.maximum(jnp.sum(valid, 0), 1)[0],
+        interventions=jnp.maximum(jnp.sum(valid, 0, dtype=jnp.int32), 1)[0],
     )
 
 
@@ -358,7 +360,7 @@ def make_profile(
     if rule.needs_expert_rollout or rule.needs_density:
         raise ValueError(f"gate must judge a prediction by itself, got {config.gate!r}")
     predictor(config.predictor).make(env)  # refused now rather than where `profile` is called
-    scale = jnp.asarray(env.spec.observation_scale)
+    scale = jnp.asarray(env.spec.observation_scale, jnp.float32)
 
     def profile(key: jax.Array, act: Policy, hparams: HParams) -> Profile:
         key, key_visited, key_kept = jax.random.split(key, 3)

@@ -22,7 +22,7 @@ from ppl_jax.config import HParams, TrainConfig, as_arrays, env_params, validate
 from ppl_jax.learned import all_finite
 from ppl_jax.losses import Metrics
 from ppl_jax.predictors import add_noise, predict, predictor
-from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory
+from ppl_jax.types import Env, Expert, Interaction, Outcome, Trajectory, in_single
 
 PyTree = Any
 KEYS = 6  # of a step
@@ -296,7 +296,7 @@ def interact(
     after, outcome = env.transition(key_env, state, executed, params)
     costly = jnp.where(takeover & (outcome.cost > 0), learner.costly + 1, 0)
     patience = learner.hparams.give_up_after
-    hopeless = (patience > 0) & (costly >= patience) & ~outcome.terminated
+    hopeless = (patience > 0) & (costly.astype(jnp.float32) >= patience) & ~outcome.terminated
     interaction = Interaction(
         observation=observation,
         next_observation=env.observe(after, params),
@@ -333,19 +333,24 @@ def store(
     physics_diverged: jax.Array | bool = False,
 ) -> Learner:
     """Give a step to the method, and count it."""
+    step = in_single(step)
     counters, done = learner.counters, step.terminated | step.truncated
+
+    def counted(count: jax.Array, happened: jax.Array | bool) -> jax.Array:
+        return count + jnp.asarray(happened, jnp.int32)
+
     return dataclasses.replace(
         learner,
         algorithm=problem.algorithm.store(learner.algorithm, step, learner.hparams),
         counters=Counters(
             steps=counters.steps + 1,
-            human_data=counters.human_data + step.takeover,
-            human_cost_steps=counters.human_cost_steps + (step.takeover & (step.cost > 0)),
-            takeovers=counters.takeovers + step.takeover_start,
-            episodes=counters.episodes + done,
-            successes=counters.successes + step.success,
+            human_data=counted(counters.human_data, step.takeover),
+            human_cost_steps=counted(counters.human_cost_steps, step.takeover & (step.cost > 0)),
+            takeovers=counted(counters.takeovers, step.takeover_start),
+            episodes=counted(counters.episodes, done),
+            successes=counted(counters.successes, step.success),
             cost=counters.cost + step.cost,
-            physics_diverged=counters.physics_diverged + physics_diverged,
+            physics_diverged=counted(counters.physics_diverged, physics_diverged),
         ),
     )
 
@@ -435,6 +440,6 @@ def summarise(losses: Metrics, before: Counters, after: Counters) -> Metrics:
         "train/takeovers": spent.takeovers,
         "train/episodes": spent.episodes,
         "train/success_rate": spent.successes / jnp.maximum(spent.episodes, 1),
-        "train/cost_per_step": spent.cost / steps,
+        "train/cost_per_step": spent.cost / steps.astype(jnp.float32),
         "train/physics_diverged_episodes": spent.physics_diverged,
     }

@@ -69,10 +69,11 @@ def adam_step(
     """
 
     def step(learned: Learned) -> Learned:
-        updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
+        with jax.numpy_dtype_promotion("standard"):  # Optax adds whole and real numbers
+            updates, opt_state = _ADAM.update(grads, learned.opt_state, learned.params)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, learned.params, updates)
         if polyak_tau is None:
-            count = learned.updates + 1.0
+            count = learned.updates.astype(jnp.float32) + 1.0
             decay = jnp.minimum(AVERAGING, count / (count + 9.0))  # young averages forget faster
         else:
             decay = 1.0 - polyak_tau

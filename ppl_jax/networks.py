@@ -70,7 +70,10 @@ def make_policy(spec: EnvSpec, hidden: tuple[int, ...]) -> Network:
 def make_raw(spec: EnvSpec, hidden: tuple[int, ...], outputs: int) -> Network:
     """A network of the observation without anything behind its last layer."""
     module = _MLP(tuple(hidden), outputs)
-    mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
+    mean, scale = (
+        jnp.asarray(spec.observation_mean, jnp.float32),
+        jnp.asarray(spec.observation_scale, jnp.float32),
+    )
 
     def init(key: jax.Array) -> Params:
         return module.init(key, spec.zeros()[0])
@@ -87,7 +90,10 @@ def make_critic(spec: EnvSpec, hidden: tuple[int, ...], count: int) -> Network:
     Parameters carry a leading [count] axis.
     """
     module = _MLP(tuple(hidden), 1)
-    mean, scale = jnp.asarray(spec.observation_mean), jnp.asarray(spec.observation_scale)
+    mean, scale = (
+        jnp.asarray(spec.observation_mean, jnp.float32),
+        jnp.asarray(spec.observation_scale, jnp.float32),
+    )
 
     def init(key: jax.Array) -> Params:
         inputs = jnp.concatenate(spec.zeros())

@@ -52,9 +52,8 @@ def preference_pairs(
             f"preference_horizon must not exceed the predicted states ({count}), got "
             f"{preference_horizon}"
         )
-    mask = (
-        step.takeover & predicted.valid & (jnp.arange(count, dtype=jnp.int32) < preference_horizon)
-    )
+    first = jnp.arange(count, dtype=jnp.float32) < preference_horizon
+    mask = step.takeover & predicted.valid & first
     observation, rejected = predicted.observation, None
     if pair_states != "future":
         observation = jnp.concatenate([step.observation[None], observation])

@@ -18,6 +18,20 @@ Array = jax.Array | np.ndarray
 """JAX's or NumPy's: for what is packed in NumPy and goes to the device later."""
 
 
+def in_single(tree: PyTree) -> PyTree:
+    """A tree whose real numbers are in single precision, as methods keep them.
+
+    An environment of one's own may give others under `jax_enable_x64`; the shipped ones do not.
+    """
+
+    def leaf(array: Any) -> jax.Array:
+        array = jnp.asarray(array)
+        real = jnp.issubdtype(array.dtype, jnp.floating)
+        return array.astype(jnp.float32) if real else array
+
+    return jax.tree.map(leaf, tree)
+
+
 @flax.struct.dataclass
 class StepInfo:
     """Step information beyond reward and termination; one struct for every environment.

@@ -161,6 +161,7 @@ def hinge_losses(
     chex.assert_shape(judged_value, (None, *good.shape))
     chex.assert_shape(other_values, (expert_value.shape[0], *distance.shape))
     chex.assert_shape(expert_value, (None, distance.shape[-1]))
+    good = good.astype(jnp.float32)
     good_loss = jnp.sum(jnp.mean(good * jax.nn.relu(margin - judged_value), -1))
     bad_loss = jnp.sum(jnp.mean((1.0 - good) * jax.nn.relu(margin + judged_value), -1))
     gap = expert_value[:, None] - other_values

@@ -97,7 +97,7 @@ def proxy_loss(
     """E[1/2 (Q(s, a_b) - y)^2 - c I (Q(s, a_b) - Q(s, a_n))], summed over critics [K, B]."""
     chex.assert_equal_shape([executed_value, novice_value])
     chex.assert_equal_shape([target, takeover, weight])
-    raised = jnp.mean(weight * takeover * (executed_value - novice_value), -1)
+    raised = jnp.mean(weight * takeover.astype(jnp.float32) * (executed_value - novice_value), -1)
     return 0.5 * td_loss(executed_value, target, weight) - conservative_weight * jnp.sum(raised)
 
 
@@ -211,7 +211,8 @@ def update(
     values = networks.critic.apply(learned.value.average, batch.next_observation, action)
     costs = networks.critic.apply(learned.cost.average, batch.next_observation, action)
     paid = batch.takeover if networks.ported else batch.takeover_start
-    price = paid * intervention_cost(batch.expert_action, batch.novice_action)
+    price = intervention_cost(batch.expert_action, batch.novice_action)
+    price = paid.astype(jnp.float32) * price
     loss = functools.partial(
         value_loss, conservative_weight=hparams.method.conservative_weight, networks=networks
     )

@@ -247,7 +247,7 @@ def store(
     state = measure_horizon(state, step, scale)
     pairs, mask = preference_pairs(step, pairs_per_step(state, hparams), method.pair_states)
     if state.random_actions is not None:
-        rank = jnp.cumsum(mask) - 1
+        rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
         rows = (state.preference_buffer.next + rank) % method.preference_capacity
         preferred, rejected = state.random_actions[:, rows]
         if method.preferred == "random":
@@ -377,7 +377,9 @@ def make_ppl(spec: EnvSpec, config: TrainConfig, reference: Reference | None = N
         name="ppl",
         init=functools.partial(init_state, policy=policy, spec=spec, config=config),
         act=lambda state, key, observation: policy.act(state.learned.params, key, observation),
-        store=functools.partial(store, scale=jnp.asarray(spec.observation_scale), method=method),
+        store=functools.partial(
+            store, scale=jnp.asarray(spec.observation_scale, jnp.float32), method=method
+        ),
         update=functools.partial(update, policy=policy, config=config, reference=reference),
         policy=lambda state: policy.layers(state.learned.average),
         predicted_steps=method.max_preference_horizon,

@@ -70,7 +70,7 @@ def proxy_value_loss(
     chex.assert_equal_shape([takeover, weight])
     chex.assert_shape(expert_value, (None, *takeover.shape))
     each = (expert_value - 1.0) ** 2 + (novice_value + 1.0) ** 2
-    return jnp.sum(jnp.mean(weight * takeover * each, -1))
+    return jnp.sum(jnp.mean(weight * takeover.astype(jnp.float32) * each, -1))
 
 
 def policy_loss(
@@ -83,7 +83,7 @@ def policy_loss(
 ) -> jax.Array:
     """-E[Q_1(s, mu(s)) + bc_weight I log pi(a_h|s)], [B] each; the mean is over the whole batch."""
     chex.assert_equal_shape([value, log_pi, takeover, weight])
-    return -jnp.mean(weight * (value + bc_weight * takeover * log_pi))
+    return -jnp.mean(weight * (value + bc_weight * takeover.astype(jnp.float32) * log_pi))
 
 
 def init_state(key: jax.Array, networks: Networks, spec: EnvSpec, config: TrainConfig) -> PVPState:

@@ -52,7 +52,8 @@ def td_target(
     chex.assert_shape(next_values, (None, *terminated.shape))
     for each in (paid, entropy):
         chex.assert_is_broadcastable(jnp.shape(each), terminated.shape)
-    return paid + discount * (1.0 - terminated) * (jnp.min(next_values, 0) + entropy)
+    goes_on = 1.0 - terminated.astype(jnp.float32)
+    return paid + discount * goes_on * (jnp.min(next_values, 0) + entropy)
 
 
 def td_loss(value: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:

@@ -112,14 +112,16 @@ def quantile(buffer: RingBuffer, values: jax.Array, share: jax.Array | float) ->
     """Quantile over the filled rows of one of a buffer's arrays, [C] -> []."""
     held = buffers.size(buffer)
     filled = jnp.where(jnp.arange(values.shape[0], dtype=jnp.int32) < held, values, jnp.inf)
-    row = jnp.floor(share * (held - 1)).astype(jnp.int32)
+    row = jnp.floor(share * (held.astype(jnp.float32) - 1)).astype(jnp.int32)
     return jnp.sort(filled)[jnp.clip(row, 0, values.shape[0] - 1)]
 
 
 def risk_target(success: jax.Array, terminated: jax.Array, following: jax.Array) -> jax.Array:
     """Probability of success: 1 where solved, else gamma (1 - terminated) times the next one's."""
     chex.assert_equal_shape([success, terminated, following])
-    return jnp.where(success, 1.0, RISK_DISCOUNT * (1.0 - terminated) * following)
+    return jnp.where(
+        success, 1.0, RISK_DISCOUNT * (1.0 - jnp.asarray(terminated, jnp.float32)) * following
+    )
 
 
 def risk_loss(params: Any, batch: RiskStep, target: jax.Array, critic: Network) -> jax.Array:
@@ -220,9 +222,8 @@ def sample_steps(state: ThriftyState, key: jax.Array, key_goals: jax.Array, coun
     """A batch [count] with a share of steps that solved the task, once there are any."""
     batch = buffers.sample(state.steps, key, count)
     goals = buffers.sample(state.goals, key_goals, count)
-    is_goal = (jnp.arange(count, dtype=jnp.int32) < GOAL_SHARE * count) & (
-        buffers.size(state.goals) > 0
-    )
+    share = jnp.arange(count, dtype=jnp.float32) < GOAL_SHARE * count
+    is_goal = share & (buffers.size(state.goals) > 0)
     return jax.tree.map(
         lambda goal, step: jnp.where(is_goal.reshape(-1, *[1] * (goal.ndim - 1)), goal, step),
         goals,

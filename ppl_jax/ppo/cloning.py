@@ -94,7 +94,7 @@ def one_round(problem: Problem, carry: Any, number: jax.Array) -> Any:
     )
     inputs = inputs.add(jnp.reshape(pairs[0], (-1, problem.env.spec.observation_size)))
     kept = [
-        jax.lax.dynamic_update_slice(to, jnp.reshape(x, (-1, x.shape[-1])), (row, 0))
+        jax.lax.dynamic_update_slice_in_dim(to, jnp.reshape(x, (-1, x.shape[-1])), row, 0)
         for to, x, row in zip(kept, pairs, 2 * [number * length * config.num_envs], strict=True)
     ]
     count = (number + 1) * length * config.num_envs
@@ -109,7 +109,7 @@ def one_round(problem: Problem, carry: Any, number: jax.Array) -> Any:
     key, key_updates = jax.random.split(learner.key)
     learner = dataclasses.replace(learner, key=key)
     share = jnp.arange(updates, dtype=jnp.float32) / max(updates, 1)
-    progress = (number + share) / config.demonstration_rounds
+    progress = (number.astype(jnp.float32) + share) / config.demonstration_rounds
     each = (jax.random.split(key_updates, updates), progress)
     cloned, losses = jax.lax.scan(update, cloned, each)
     return (learner, cloned, inputs, kept), {

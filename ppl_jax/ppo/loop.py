@@ -356,7 +356,7 @@ def iterate(problem: Problem, learner: PPOLearner, _: None) -> tuple[PPOLearner,
     diverged = learner.diverged | ~all_finite((metrics, learned))
     kept = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), learned, before)
     metrics |= {
-        "episodes": jnp.sum(steps.done),
+        "episodes": jnp.sum(steps.done, dtype=jnp.int32),
         "episodic_return": mean_of_ended(steps.ended.reward, steps.done)[0],
         "episodic_cost": cost,
         "episode_length": mean_of_ended(steps.ended.length, steps.done)[0],

@@ -37,14 +37,15 @@ def advantages(
         discount, gae_lambda: gamma and lambda.
     """
     chex.assert_equal_shape([reward, value, next_value])
-    delta = reward + discount * (1.0 - terminated) * next_value - value
+    delta = reward + discount * (1.0 - jnp.asarray(terminated, jnp.float32)) * next_value - value
 
     def step(following: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         delta, done = at
         advantage = delta + discount * gae_lambda * (1.0 - done) * following
         return advantage, advantage
 
-    return jax.lax.scan(step, jnp.zeros_like(delta[0]), (delta, done), reverse=True)[1]
+    steps = (delta, jnp.asarray(done, jnp.float32))
+    return jax.lax.scan(step, jnp.zeros_like(delta[0]), steps, reverse=True)[1]
 
 
 def clipped_loss(
@@ -80,8 +81,9 @@ def clip_grads(grads: PyTree, norm: jax.Array | float) -> PyTree:
 
 def mean_of_ended(values: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean over the episodes that ended (0 where none did), and whether any did."""
-    count = jnp.sum(done)
-    return jnp.sum(jnp.where(done, values, 0.0)) / jnp.maximum(count, 1), count > 0
+    count = jnp.sum(done, dtype=jnp.float32)
+    total = jnp.sum(jnp.where(done, values.astype(jnp.float32), 0.0))
+    return total / jnp.maximum(count, 1.0), count > 0
 
 
 @flax.struct.dataclass

@@ -14,7 +14,7 @@ from ppl_jax.learned import Learned
 from ppl_jax.networks import Network, make_policy, make_raw
 from ppl_jax.ppo.config import PPOConfig, PPOHParams
 from ppl_jax.ppo.losses import Multiplier, RunningStats
-from ppl_jax.types import Env, Expert, PyTree
+from ppl_jax.types import Env, Expert, PyTree, in_single
 
 LEAST_SCALE = 0.1  # of an input, in the environment's own scale: hardly varying ones stay small
 
@@ -148,14 +148,14 @@ def start_envs(problem: Problem, key: jax.Array) -> dict[str, Any]:
     keys, zero = jax.random.split(key, count), jnp.zeros(count, jnp.float32)
     observation, env_state = jax.vmap(problem.env.reset, in_axes=(0, None))(keys, problem.params)
     played = Played(reward=zero, cost=zero, length=zero)
-    return {"observation": observation, "env_state": env_state, "played": played}
+    return {"observation": in_single(observation), "env_state": env_state, "played": played}
 
 
 def centre_and_scale(problem: Problem, inputs: RunningStats) -> tuple[jax.Array, jax.Array]:
     """Mean and scale of the inputs of policy and critics, [O] each."""
     mean, scale = (
-        jnp.asarray(problem.env.spec.observation_mean),
-        jnp.asarray(problem.env.spec.observation_scale),
+        jnp.asarray(problem.env.spec.observation_mean, jnp.float32),
+        jnp.asarray(problem.env.spec.observation_scale, jnp.float32),
     )
     if problem.config.scaling == "world":
         return mean, scale
@@ -180,6 +180,7 @@ def step_envs(problem: Problem, key: jax.Array, learner: PPOLearner, action: jax
         jnp.clip(action, -1.0, 1.0),
         problem.params,
     )
+    observation, reward, info = in_single((observation, reward, info))
     played = Played(
         reward=learner.played.reward + reward,
         cost=learner.played.cost + info.cost,
@@ -223,7 +224,7 @@ def rollout(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Rollout]
             observation=observation,
             action=action,
             final_observation=info.final_observation,
-            reward=reward + learner.hparams.success_bonus * info.success,
+            reward=reward + jnp.where(info.success, learner.hparams.success_bonus, 0.0),
             cost=info.cost,
             terminated=terminated,
             done=done,

@@ -82,7 +82,7 @@ def shaped_reward(eef: jax.Array, cube: jax.Array, grasped: jax.Array) -> jax.Ar
         grasped: Both pads touch the cube.
     """
     reach = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - cube))
-    return jnp.where(lifted(cube), BEST, reach + GRASP * grasped) / BEST
+    return jnp.where(lifted(cube), BEST, reach + jnp.where(grasped, GRASP, 0.0)) / BEST
 
 
 def lifted(cube: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ def with_values(array: jax.Array, places: Any, new: Any) -> jax.Array:
     """
     count = array.shape[0]
     at = np.arange(count)[places]
-    order = np.arange(count)
+    order = np.arange(count, dtype=np.int32)
     order[at] = count + np.arange(at.size).reshape(at.shape)
     added = jnp.reshape(jnp.asarray(new, array.dtype), (at.size, *array.shape[1:]))
     return jnp.concatenate([array, added])[order]

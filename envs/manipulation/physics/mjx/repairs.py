@@ -71,8 +71,8 @@ def mjx() -> Any:
     return module
 
 
-def in_single(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that calls MJX, traced as without `jax_enable_x64`.
+def with_mjx_flags(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that calls MJX, traced as without `jax_enable_x64` and strict type promotion.
 
     MJX's own constants have the type that the flag says, so that with it a step would be partly in
     double precision, and its loops would not trace. All that it is given is in single precision.
@@ -80,7 +80,7 @@ def in_single(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def traced(*args: Any, **kwargs: Any) -> Any:
-        with jax.enable_x64(False):
+        with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):
             return function(*args, **kwargs)
 
     return traced

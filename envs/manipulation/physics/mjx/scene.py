@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.manipulation.physics.mjx import newton, source, warp
 from envs.manipulation.physics.mjx import rows as constraint_rows
-from envs.manipulation.physics.mjx.repairs import in_single, mjx, private
+from envs.manipulation.physics.mjx.repairs import mjx, private, with_mjx_flags
 from envs.manipulation.physics.mujoco_c import MayClose, import_mujoco
 from envs.manipulation.randomisation import NOMINAL, Factors
 
@@ -62,7 +62,7 @@ class Scene:
         pairs: [C, 2] geoms of each contact of MJX's; None where they have no fixed places.
     """
 
-    @in_single
+    @with_mjx_flags
     def __init__(
         self,
         model: source.Source,
@@ -205,7 +205,8 @@ class Scene:
         wide = [n for n, i in zip(names, found, strict=True) if self.model.jnt_type[i] < 2]
         if wide:
             raise ValueError(f"joint {wide[0]!r} must be a hinge or a slide")
-        return self.model.jnt_qposadr[found].astype(int), self.model.jnt_dofadr[found].astype(int)
+        model = self.model
+        return model.jnt_qposadr[found].astype(np.int32), model.jnt_dofadr[found].astype(np.int32)
 
     def free_joint(self, name: str) -> tuple[slice, slice]:
         """Places of a free joint: seven of `qpos`, six of `qvel`."""
@@ -233,7 +234,7 @@ class Scene:
         ]
         if not found:
             raise ValueError(f"no contact between geoms {first!r}... and {second!r}... is possible")
-        return np.array(found, int)
+        return np.array(found, np.int32)
 
     # ---- states
 
@@ -276,7 +277,7 @@ class Scene:
             **{name: value for name, value in given.items() if value is not None},
         )
 
-    @in_single
+    @with_mjx_flags
     def placed(self, bodies: Bodies, put: Any = None) -> Any:
         """MJX's data with the frames of bodies, geoms and sites, and the joints' axes."""
         put = self.put if put is None else put
@@ -294,7 +295,7 @@ class Scene:
             data = data.tree_replace({"_impl.contact.dist": gap})
         return data
 
-    @in_single
+    @with_mjx_flags
     def at_rest(self, bodies: Bodies, put: Any = None) -> Any:
         """MJX's data of a start, as `sense` takes it: frames and contacts; forces are zero."""
         put = self.put if put is None else put
@@ -317,7 +318,7 @@ class Scene:
 
     # ---- physics
 
-    @in_single
+    @with_mjx_flags
     def step(self, data: Any, control: Control, put: Any = None) -> Any:
         """One physics step: MuJoCo's `mj_step1`, the controller, `mj_step2`.
 
