@@ -190,7 +190,7 @@ def query_expert(
     assert problem.expert is not None  # else the caller of `interact` says what it does
     key_expert, key_noise = jax.random.split(key)
     params = params_of(problem, learner.hparams)
-    action = problem.expert(key_expert, learner.env_state, observation, params)
+    action = in_single(problem.expert(key_expert, learner.env_state, observation, params))
     noise = learner.hparams.expert_noise * jax.random.normal(key_noise, action.shape, jnp.float32)
     return jnp.clip(action + noise, -1.0, 1.0)
 

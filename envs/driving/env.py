@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment
+from envs.derivatives import length
 from envs.driving import navigation as nav
 from envs.driving import observation as obs
 from envs.driving import traffic as traffic_model
@@ -183,7 +184,7 @@ def reward_and_cost(
     lane_index = jnp.where(on_reference, navigation.lane, scenario.route_lane[navigation.road])
     lane = tree_index(lanes, lane_index)
     before, _ = lane_coordinates(lane, ego.last_pose[:2])
-    speed = jnp.sqrt(jnp.sum(ego.velocity**2))
+    speed = length(ego.velocity)
     reward = (
         params.progress_weight * (long[lane_index] - before)
         + params.speed_weight * speed / vehicle.MAX_SPEED
@@ -337,7 +338,7 @@ class Driving(Environment):
         scenario = tree_index(params.scenarios, state.scenario)
         lane = tree_index(scenario.lanes, state.navigation.lane)
         ego_long, _ = lane_coordinates(lane, state.ego.pose[:2])
-        speed = jnp.sqrt(jnp.sum(state.ego.velocity**2))
+        speed = length(state.ego.velocity)
         traffic = traffic_model.advance(
             scenario,
             state.traffic,
@@ -435,7 +436,7 @@ class Driving(Environment):
             success=events.arrived,
             unsafe=(events.off_road | events.crash_vehicle | events.crash_object) & ~events.arrived,
             progress=navigation.travelled / scenario.route_length,
-            speed=jnp.sqrt(jnp.sum(ego.velocity**2)),
+            speed=length(ego.velocity),
             clearance=jnp.minimum(
                 jnp.minimum(found.left, found.right) - vehicle.HALF_SIZE[1],
                 -jnp.max(touch.depth),

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.derivatives import length
 from envs.driving import traffic as traffic_model
 from envs.driving.env import DrivingParams, DrivingState
 from envs.driving.geometry import lane_coordinates, lane_position, to_body
@@ -114,7 +115,7 @@ def drive(state: DrivingState, params: DrivingParams, cruise_speed: float) -> ja
     road = state.navigation.road
     reference = tree_index(lanes, scenario.route_lane[road])
     long, lateral = lane_coordinates(reference, ego.pose[:2])
-    speed = jnp.sqrt(jnp.sum(ego.velocity**2))
+    speed = length(ego.velocity)
     width = reference.width
     here = lateral / width  # lane number as a real number
     ego_along = _along_route(scenario, road, long)

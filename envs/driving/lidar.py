@@ -14,6 +14,7 @@ RANGE = 50.0  # m
 _ANGLES = np.arange(RAYS) * (2 * np.pi / RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)]).astype(np.float32)  # [2, RAYS]
 _MISS = 1e9
+_GRAZING = 1e-12  # m^2, of half a chord: below it the root's derivative would not be finite
 
 
 def box_distances(pose: Array, boxes: Array, half: Array) -> jax.Array:
@@ -67,7 +68,7 @@ def circle_distances(pose: Array, circles: Array) -> jax.Array:
         along = x[k] * _DIRECTIONS[0] + y[k] * _DIRECTIONS[1]
         across = x[k] * _DIRECTIONS[1] - y[k] * _DIRECTIONS[0]
         inside = square[k] - across * across
-        enter = along - jnp.sqrt(jnp.maximum(inside, 0.0))
+        enter = along - jnp.sqrt(jnp.maximum(inside, _GRAZING))
         hit = (inside >= 0) & (enter >= 0)
         nearest = jnp.minimum(nearest, jnp.where(hit, enter, _MISS))
     return nearest

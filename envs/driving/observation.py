@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.derivatives import length
 from envs.driving import lidar
 from envs.driving.geometry import lane_position, to_body, wrap
 from envs.driving.navigation import Navigation
@@ -92,7 +93,7 @@ def ego_features(
     )
     normal = normal / jnp.sqrt(jnp.sum(normal * normal) + 1e-12)
     heading = jnp.stack([jnp.cos(ego.pose[2]), jnp.sin(ego.pose[2])])
-    speed = jnp.sqrt(jnp.sum(ego.velocity**2)) * 3.6
+    speed = length(ego.velocity) * 3.6
     yaw = jnp.abs(wrap(ego.pose[2] - ego.last_pose[2])) / CONTROL_STEP
     following = jnp.minimum(navigation.road + 1, scenario.route_roads - 1)
     state = jnp.stack(

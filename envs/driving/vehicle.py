@@ -26,6 +26,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from envs.derivatives import length
 from ppl_jax.types import Array
 
 CONTROL_STEP, SUBSTEP, SUBSTEPS = 0.1, 0.02, 5  # s
@@ -192,7 +193,7 @@ def drive_kinematic(
     """
     action = jnp.clip(action, -1.0, 1.0)
     throttle = action[1]
-    speed = jnp.sqrt(jnp.sum(ego.velocity**2))
+    speed = length(ego.velocity)
     acceleration = jnp.where(
         throttle >= 0,
         4 * engine_force * throttle / MASS,

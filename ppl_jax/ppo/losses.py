@@ -165,6 +165,7 @@ def update_multiplier(
         rate: Adam's.
         known: Whether any episode ended.
     """
-    step, opt_state = _ADAM.update(limit - cost, multiplier.opt_state)
+    with jax.numpy_dtype_promotion("standard"):  # as in `ppl_jax.learned.adam_step`
+        step, opt_state = _ADAM.update(limit - cost, multiplier.opt_state)
     moved = Multiplier(multiplier.p - rate * jnp.asarray(step), opt_state)
     return jax.tree.map(lambda new, old: jnp.where(known, new, old), moved, multiplier)

@@ -202,9 +202,8 @@ def query_expert(
     """The expert's action in every environment, [W, A]."""
     assert problem.expert is not None  # see `make_ppo_lagrangian`
     keys = jax.random.split(key, problem.config.num_envs)
-    return jax.vmap(problem.expert, in_axes=(0, 0, 0, None))(
-        keys, env_state, observation, problem.params
-    )
+    ask = jax.vmap(problem.expert, in_axes=(0, 0, 0, None))
+    return in_single(ask(keys, env_state, observation, problem.params))
 
 
 def rollout(problem: Problem, learner: PPOLearner) -> tuple[PPOLearner, Rollout]:

@@ -44,7 +44,7 @@ _SETTLING = 1e-3  # rad/s, within which friction in the joints builds up
 def rotation_from(vector: Vector) -> Matrix:
     """Rotation by |vector| about vector (Rodrigues), finite at zero."""
     square = dot(vector, vector)
-    angle = jnp.sqrt(square + 1e-20)
+    angle = jnp.sqrt(square + 1e-16)  # its fourth power is a number, for the derivative
     sine = jnp.sin(angle) / angle
     fall = (1.0 - jnp.cos(angle)) / (angle * angle)
     x, y, z = vector

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.derivatives import length
 from envs.manipulation.control.gripper_on_mjx import TwoFingerGripper
 from envs.manipulation.control.on_mjx import ur5e
 from envs.manipulation.physics.analytic import grasp_contact, gripper
@@ -81,7 +82,7 @@ def shaped_reward(eef: jax.Array, cube: jax.Array, grasped: jax.Array) -> jax.Ar
         eef, cube: [3] of grip site and cube's centre, m.
         grasped: Both pads touch the cube.
     """
-    reach = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - cube))
+    reach = 1 - jnp.tanh(10 * length(eef - cube))
     return jnp.where(lifted(cube), BEST, reach + jnp.where(grasped, GRASP, 0.0)) / BEST
 
 

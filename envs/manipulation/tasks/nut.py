@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.derivatives import length
 from envs.manipulation.physics.analytic import gripper, unrolled_linalg
 from envs.manipulation.physics.analytic.arm import frames, jacobian, twist_of
 from envs.manipulation.physics.analytic.quaternion import (
@@ -124,11 +125,11 @@ def stages(
         touching: Both pads touch the ring.
         time: Steps since the start, this one included.
     """
-    reach = REACH * (1 - jnp.tanh(10 * jnp.linalg.norm(eef - handle)))
+    reach = REACH * (1 - jnp.tanh(10 * length(eef - handle)))
     missing = jnp.where(time <= DISTRACTED, 0.0, jnp.maximum(LIFT_HEIGHT - position[2], 0.0))
     lift = jnp.where(touching, GRASP + (LIFT - GRASP) * (1 - jnp.tanh(15 * missing)), 0.0)
     away = position[:2] - jnp.array(PEG[:2], jnp.float32)
-    hover = lift + (HOVER - LIFT) * (1 - jnp.tanh(10 * jnp.linalg.norm(away)))
+    hover = lift + (HOVER - LIFT) * (1 - jnp.tanh(10 * length(away)))
     on = jnp.all(jnp.abs(away) < PEG_RANGE) & (position[2] < PEG_HEIGHT)
     return jnp.stack([reach, jnp.where(touching, GRASP, 0.0), lift, hover]), on
 
@@ -217,7 +218,7 @@ class NutAssembly(ArmTask):
             touching=new.touching,
             time=new.time,
         )
-        near = 1 - jnp.tanh(10 * jnp.linalg.norm(eef - position))
+        near = 1 - jnp.tanh(10 * length(eef - position))
         success = on & (near < PRESENCE) & ~physics_diverged
         fallen = position[2] < FALLEN
         # as in robosuite, a ring on the peg no longer counts in the stages
@@ -231,7 +232,7 @@ class NutAssembly(ArmTask):
             success=success,
             unsafe=fallen,
             progress=jnp.where(success, 1.0, jnp.max(staged)),
-            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(new.speeds))[0])),
+            speed=length(jnp.stack(twist_of(jacobian(at), list(new.speeds))[0])),
             physics_diverged=physics_diverged,
         )
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.derivatives import length
 from envs.manipulation.control.gripper_on_mjx import TwoFingerGripper
 from envs.manipulation.control.on_mjx import Goal, OperationalSpace
 from envs.manipulation.physics.lanes import one_after_another
@@ -271,7 +272,7 @@ class SceneTask(ArmTask):
             success=success,
             unsafe=unsafe,
             progress=jnp.asarray(progress, jnp.float32),
-            speed=jnp.linalg.norm(new.site.velocity),
+            speed=length(new.site.velocity),
             physics_diverged=diverged,
         )
 

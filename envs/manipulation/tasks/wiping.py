@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.derivatives import length
 from envs.manipulation.physics.analytic import unrolled_linalg
 from envs.manipulation.physics.analytic.arm import (
     Frames,
@@ -193,7 +194,7 @@ def reward_of(
     """
     _, _, centroid = remaining(markers, wiped)
     away = centroid - eef
-    reach = REACH * (1 - jnp.tanh(REACH_RATE * jnp.sqrt(jnp.sum(away * away))))
+    reach = REACH * (1 - jnp.tanh(REACH_RATE * length(away)))
     done = jnp.all(wiped)
     low, high = FORCE_RANGE
     pressing = CONTACT + 0.01 * force + jnp.where(count > MANY_CONTACTS, 10 * CONTACT, 0.0)
@@ -288,7 +289,7 @@ class TableWiping(ArmTask):
         heavier = self.factors(state, params).mass
         weight = jnp.array([0.0, 0.0, -9.81 * WIPER.mass], jnp.float32) * heavier
         force = sound(-turn @ (push + weight), state.force)
-        contact = jnp.linalg.norm(force - state.force_bias) > CONTACT_FORCE
+        contact = length(force - state.force_bias) > CONTACT_FORCE
         over = over_table(jnp.stack(at.position[:2]))
         count = contact_count(at, jnp.where(over, TABLE_TOP, _FAR))
         at_limit = jnp.any(JOINT_LIMIT - jnp.abs(joints) < LIMIT_MARGIN)
@@ -301,13 +302,13 @@ class TableWiping(ArmTask):
             wiped,
             markers=state.markers,
             eef=jnp.stack(at.position) + BASE,
-            force=jnp.linalg.norm(state.force),
+            force=length(state.force),
             contact=contact,
             count=count,
         )
         success = jnp.all(wiped) & ~physics_diverged
         time = state.time + 1
-        first = jnp.linalg.norm(state.force_bias) == 0
+        first = length(state.force_bias) == 0
         new = dataclasses.replace(
             arm,
             force=force,
@@ -328,7 +329,7 @@ class TableWiping(ArmTask):
             success=success,
             unsafe=unsafe,
             progress=jnp.mean(wiped.astype(jnp.float32)),
-            speed=jnp.linalg.norm(jnp.stack(twist_of(jacobian(at), list(speeds))[0])),
+            speed=length(jnp.stack(twist_of(jacobian(at), list(speeds))[0])),
             physics_diverged=physics_diverged,
         )
 

@@ -28,7 +28,7 @@ _TOOL_RADIUS = 0.015
 # pairs (mover, other) of capsules; 6 is the tool, 7 the mount
 _PAIRS = np.array(
     [(6, 2), (6, 1), (6, 0), (6, 7), (5, 2), (5, 1), (5, 0), (5, 7), (4, 1), (4, 0), (4, 7),
-     (3, 1), (3, 0), (3, 7), (2, 0), (2, 7)]
+     (3, 1), (3, 0), (3, 7), (2, 0), (2, 7)], np.int32
 )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ FEET = np.concatenate(
 )
 _ROWS = len(gripper.PAD_ROWS)
 _PADS = 4 * _ROWS  # points on the pads: left then right finger, two per row
-_EDGE = np.array([0, _ROWS, 2 * _ROWS, 3 * _ROWS])  # those of the lower edges, which meet the table
+_EDGE = np.int32([0, _ROWS, 2 * _ROWS, 3 * _ROWS])  # those of the lower edges, which meet the table
 
 
 class Ring(NamedTuple):

@@ -118,7 +118,7 @@ def _fields(motion: Motion) -> jax.Array:
 # where entry (axis a of moment i, axis b of moment j) of the 9 x 9 form lies in the [6, 6] sums
 _ENTRY = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 _MOMENT = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-_PLACE = (_ENTRY[None, :, None, :] * 6 + _MOMENT[:, None, :, None]).reshape(81)
+_PLACE = (_ENTRY[None, :, None, :] * 6 + _MOMENT[:, None, :, None]).reshape(81).astype(np.int32)
 
 
 def _spread(sums: jax.Array) -> jax.Array:

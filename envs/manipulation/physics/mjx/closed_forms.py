@@ -14,13 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from envs.derivatives import length
+
 _NEXT_TO_NOTHING = 1e-12
-
-
-def _length(vector: jax.Array) -> jax.Array:
-    """Of a vector [3], m, with a gradient at zero."""
-    square = jnp.sum(vector * vector)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def _touch(sphere: Any, normal: jax.Array, gap: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -50,7 +46,7 @@ def sphere_cylinder(sphere: Any, cylinder: Any) -> tuple[jax.Array, jax.Array, j
     away = sphere.pos - cylinder.pos
     along = jnp.sum(away * axis)
     across = away - along * axis
-    off = _length(across)
+    off = length(across)
     outwards = jnp.where(
         off > _NEXT_TO_NOTHING, across / jnp.maximum(off, _NEXT_TO_NOTHING), cylinder.mat[:, 0]
     )
@@ -75,7 +71,7 @@ def sphere_box(sphere: Any, box: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     away = sphere.pos - box.pos
     centre = jnp.sum(away[:, None] * box.mat, 0)  # in the box's axes
     to_nearest = jnp.clip(centre, -box.size, box.size) - centre
-    outside = _length(to_nearest)
+    outside = length(to_nearest)
     depth = box.size - jnp.abs(centre)
     face = jnp.arange(3, dtype=jnp.int32) == jnp.argmin(depth)
     inwards = jnp.where(face, jnp.where(centre < 0, 1.0, -1.0), 0.0)
