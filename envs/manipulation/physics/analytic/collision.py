@@ -74,7 +74,7 @@ def arm_hits(
     ]
     p, q, r = jnp.stack(first), jnp.stack(second), np.array([*radius, _TOOL_RADIUS, _MOUNT[2]])
     i, j = _PAIRS.T
-    own = _segment_distance(p[i], q[i], p[j], q[j]) < np.float32(r[i] + r[j])
+    own = _segment_distance(p[i], q[i], p[j], q[j]) < (r[i] + r[j]).astype(np.float32)
     centre, half, top = table
     ends = jnp.concatenate([p[1:6], q[1:6]])
     reach = np.concatenate([r[1:6], r[1:6]])

@@ -57,7 +57,8 @@ FEET = np.concatenate(
 )
 _ROWS = len(gripper.PAD_ROWS)
 _PADS = 4 * _ROWS  # points on the pads: left then right finger, two per row
-_EDGE = np.int32([0, _ROWS, 2 * _ROWS, 3 * _ROWS])  # those of the lower edges, which meet the table
+# those of the lower edges, which meet the table
+_EDGE = np.array([0, _ROWS, 2 * _ROWS, 3 * _ROWS], np.int32)
 
 
 class Ring(NamedTuple):
@@ -191,8 +192,8 @@ def hold(
     origin, axes = hand_axes(motion)
     pads, slopes = pad_points(origin, axes, fingers, inner)
     tips, tip_slopes = pads[_EDGE], slopes[_EDGE]
-    beads = ring.position + np.float32(BEADS) @ ring.rotation.T
-    feet = ring.position + np.float32(FEET) @ ring.rotation.T
+    beads = ring.position + BEADS.astype(np.float32) @ ring.rotation.T
+    feet = ring.position + FEET.astype(np.float32) @ ring.rotation.T
     groups = (on_handle(pads, ring), _upward(tips), _upward(feet), _around_peg(beads))
     gap, place, normal, tangent = (jnp.concatenate(parts) for parts in zip(*groups, strict=True))
     frame = jnp.stack([tangent, jnp.cross(normal, tangent), normal])  # [3, C, 3]
@@ -206,10 +207,11 @@ def hold(
     arm_place = place[:carried] - site
     swept = linear[:, None] + jnp.cross(angular[:, None], arm_place[None])  # [6, F, 3]
     by_arm = jnp.sum(frame[:, :carried, None] * jnp.swapaxes(swept, 0, 1)[None], -1)  # [3, F, 6]
-    left = np.float32([1] * 2 * _ROWS + [0] * 2 * _ROWS + [1, 1, 0, 0])
+    left = np.array([1] * 2 * _ROWS + [0] * 2 * _ROWS + [1, 1, 0, 0], np.float32)
     by_finger = jnp.sum(frame[:, :carried] * jnp.concatenate([slopes, tip_slopes]), -1)
     by_finger = jnp.stack([by_finger * left, by_finger * (1 - left)], -1)  # [3, F, 2]
-    sign = np.repeat(np.float32([-1, 0, 1]), [_PADS, len(_EDGE), len(FEET) + len(BEADS)])
+    sides = np.array([-1, 0, 1], np.float32)
+    sign = np.repeat(sides, [_PADS, len(_EDGE), len(FEET) + len(BEADS)])
     arms = place - ring.position
     by_ring = jnp.concatenate([frame, jnp.cross(arms[None], frame)], -1) * sign[None, :, None]
     none = np.zeros((3, len(FEET) + len(BEADS), 8), np.float32)
@@ -222,7 +224,7 @@ def hold(
     friction = FRICTION * factors.friction
     speed = jnp.concatenate([jnp.stack(motion.speeds), finger_speeds, ring.velocity, ring.spin])
     inverse = np.repeat([57.2, 5.7, 51.5], [_PADS, len(_EDGE), len(FEET) + len(BEADS)])
-    stiff = np.float32(IMPEDANCE / ((1 - IMPEDANCE) * inverse))
+    stiff = (IMPEDANCE / ((1 - IMPEDANCE) * inverse)).astype(np.float32)
     weight = jnp.where(gap < 0, stiff, 0.0)
     depth = jnp.maximum(-gap, 0.0)
     rest = DAMP * (rows @ speed)
@@ -341,7 +343,7 @@ def _inertia(
 
     ring_mass = RING_MASS * heavier
     centre = RING_CENTRE * ring.rotation[:, 0]
-    about = (ring.rotation * (np.float32(RING_INERTIA) * heavier)) @ ring.rotation.T
+    about = (ring.rotation * (RING_INERTIA.astype(np.float32) * heavier)) @ ring.rotation.T
     eye = jnp.eye(3, dtype=jnp.float32)
     about = about + ring_mass * (jnp.sum(centre * centre) * eye - jnp.outer(centre, centre))
     zero = jnp.zeros((), jnp.float32)

@@ -83,7 +83,7 @@ def pad_rows(knuckle: jax.Array, inner: jax.Array) -> tuple[jax.Array, jax.Array
     finger mirrors y.
     """
     turn = knuckle + inner
-    along = np.float32(TIP + PAD_ROWS)
+    along = (TIP + PAD_ROWS).astype(np.float32)
     sine, cosine = jnp.sin(knuckle), jnp.cos(knuckle)
     tilt, level = jnp.sin(turn), jnp.cos(turn)
     out_y = FINGER[0] * cosine - FINGER[1] * sine + FACE * level - along * tilt
@@ -132,11 +132,11 @@ def pad_spheres(knuckles: Any, inner: Any) -> jax.Array:
     Args:
         knuckles, inner: [2] rad.
     """
-    along = np.float32(TIP + PAD_ROWS)
+    along = (TIP + PAD_ROWS).astype(np.float32)
     sine, cosine = jnp.sin(inner)[:, None], jnp.cos(inner)[:, None]
     y = FINGER[0] + FACE * cosine - along * sine
     z = FINGER[1] + FACE * sine + along * cosine
-    x = np.repeat(np.float32([-PAD_HALF, PAD_HALF]), len(along))
+    x = np.repeat(np.array([-PAD_HALF, PAD_HALF], np.float32), len(along))
     face = jnp.stack(
         [jnp.broadcast_to(x, (2, len(x))), jnp.tile(y + PAD_SPHERE, (1, 2)), jnp.tile(z, (1, 2))],
         -1,
