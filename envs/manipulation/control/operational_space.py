@@ -44,9 +44,10 @@ _SETTLING = 1e-3  # rad/s, within which friction in the joints builds up
 def rotation_from(vector: Vector) -> Matrix:
     """Rotation by |vector| about vector (Rodrigues), finite at zero."""
     square = dot(vector, vector)
-    angle = jnp.sqrt(square + 1e-16)  # its fourth power is a number, for the derivative
+    angle = jnp.sqrt(square + 1e-20)
     sine = jnp.sin(angle) / angle
-    fall = (1.0 - jnp.cos(angle)) / (angle * angle)
+    # 0 where the floor cuts in, whose square is a number, for the derivative
+    fall = (1.0 - jnp.cos(angle)) / jnp.maximum(angle * angle, 1e-18)
     x, y, z = vector
     return (
         (1.0 - fall * (y * y + z * z), fall * x * y + sine * z, fall * x * z - sine * y),

@@ -25,13 +25,8 @@ def one_after_another(
     """
     if jax.default_backend() != "cpu":
         return advance(state, action, factors)
-    # of plain numbers, which change no program
-    given = (state, action) if factors is NOMINAL else (state, action, factors)
-
-    def one(state: Any, action: jax.Array, factors: Factors = NOMINAL) -> Any:
-        return advance(state, action, factors)
-
-    lanes = jax.custom_jvp(jax.custom_batching.sequential_vmap(one))
-    # a function with a batching rule of its own has no derivative in reverse
-    lanes.defjvp(lambda primals, tangents: jax.jvp(one, primals, tangents))
-    return lanes(*given)
+    if factors is NOMINAL:  # of plain numbers, which change no program
+        return jax.custom_batching.sequential_vmap(lambda s, a: advance(s, a, NOMINAL))(
+            state, action
+        )
+    return jax.custom_batching.sequential_vmap(advance)(state, action, factors)
