@@ -69,33 +69,24 @@ def train_expert(settings: ExpertSettings, out: Path, resume: bool = False) -> d
         UserError: If settings or folder cannot be used.
     """
     check(settings)
-    began = time.perf_counter()
-    folder, env = RunFolder(out), build_env(settings)
+    with owned(out):
+        return _train(settings, RunFolder(out), resume)
+
+
+def _train(settings: ExpertSettings, folder: RunFolder, resume: bool) -> dict[str, Any]:
+    """`train_expert` in a folder that is this process's own."""
+    began, config = time.perf_counter(), settings.config
+    env = build_env(settings)
     try:
         teacher = env.experts.get(env.card.expert.teacher)
-        functions = make_ppo_lagrangian(env, settings.config, expert=teacher)
+        functions = make_ppo_lagrangian(env, config, expert=teacher)
     except ValueError as error:
         raise UserError(str(error)) from error
-    with owned(out):
-        if resume:
-            before = read_settings(folder)
-            refuse_contradictions(out, one_level(before.as_json()), one_level(settings.as_json()))
-        else:
-            open_folder(folder, settings.as_json(), resume=False)
-        return _train(settings, folder, env, functions, resume=resume, began=began)
-
-
-def _train(
-    settings: ExpertSettings,
-    folder: RunFolder,
-    env: Env,
-    functions: PPOFunctions,
-    *,
-    resume: bool,
-    began: float,
-) -> dict[str, Any]:
-    """The run in its folder, from the start or the last checkpoint; returns the summary."""
-    config = settings.config
+    if resume:
+        before = one_level(read_settings(folder).as_json())
+        refuse_contradictions(folder.path, before, one_level(settings.as_json()))
+    else:
+        open_folder(folder, settings.as_json(), resume=False)
     learner = jax.jit(functions.init)(jax.random.key(settings.seed), settings.hparams)
     done = 0
     if resume:

@@ -34,6 +34,7 @@ def owned(folder: Path) -> Iterator[None]:
     Raises:
         UserError: If another process writes to it, or it cannot be written.
     """
+    there = folder.is_dir()
     make_out_folder(folder)
     path = folder / LOCK
     try:
@@ -64,6 +65,9 @@ def owned(folder: Path) -> Iterator[None]:
         finally:
             with contextlib.suppress(OSError):
                 _say(file, "")
+                if not there and list(folder.iterdir()) == [path]:  # nothing came of it
+                    path.unlink()
+                    folder.rmdir()
 
 
 def _say(file: TextIO, line: str) -> None:

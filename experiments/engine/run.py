@@ -118,7 +118,12 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
         UserError: If settings or folder cannot be used.
     """
     check(settings)
-    folder = RunFolder(out)
+    with owned(out):
+        return _train(settings, RunFolder(out), resume)
+
+
+def _train(settings: RunSettings, folder: RunFolder, resume: bool) -> dict[str, Any]:
+    """`train` in a folder that is this process's own."""
     began = time.perf_counter()
     try:
         env, functions = _functions(settings)
@@ -130,17 +135,9 @@ def train(settings: RunSettings, out: Path, resume: bool = False) -> dict[str, A
             f"evaluate_every must be a multiple of rollout_steps ({every}) for "
             f"{settings.algorithm}, got {settings.evaluate_every}"
         )
+    open_folder(folder, settings.as_json(), resume)
     interval = settings.config.decision_interval
     programs = Programs(env, functions, interval, on=settings.evaluate_on)
-    with owned(out):
-        open_folder(folder, settings.as_json(), resume)
-        return _train(settings, folder, programs, resume=resume, began=began)
-
-
-def _train(
-    settings: RunSettings, folder: RunFolder, programs: Programs, *, resume: bool, began: float
-) -> dict[str, Any]:
-    """The run in its folder, from the start or the last checkpoint; returns the summary."""
     learner = programs.init(jax.random.key(settings.seed), settings.hparams)
     chunks = plan(settings.config, settings.evaluate_every)
     runner, done = _Runner(settings, folder, programs), 0

@@ -89,6 +89,7 @@ def figure(
     if kind is not None:
         known("kind", kind, KINDS)
     need("matplotlib", "plot", "ppl figure")
+    _check_ending(out)
     if kind == "steering":
         from experiments.report.steering import steering
 
@@ -118,6 +119,16 @@ def figure(
         over_axis(points, several[0], out, column, steps=steps)
     else:
         heatmap(points, several, out, column)
+
+
+def _check_ending(out: Path) -> None:
+    """Refuse a kind of picture that matplotlib does not write."""
+    from matplotlib.figure import Figure
+
+    kinds = Figure().canvas.get_supported_filetypes()
+    if out.suffix[1:].lower() not in kinds:
+        endings = ", ".join(f".{kind}" for kind in sorted(kinds))
+        raise UserError(f"out must end in {endings}, got {str(out)!r}")
 
 
 def _cards(folder: Path) -> list[Path]:

@@ -123,6 +123,8 @@ def test_a_figure_that_the_results_do_not_have(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="holds no results"):
         figures.figure(tmp_path / "other.csv", out=tmp_path / "x.png")
+    with pytest.raises(UserError, match=r"out must end in .*\.png.*, got "):
+        figures.figure(path, out=tmp_path / "x.xyz")
     with pytest.raises(UserError, match="no file of `ppl horizon`"):
         figures.figure(path, kind="horizon", out=tmp_path / "x.png")
 

@@ -96,6 +96,9 @@ def test_a_folder_has_one_owner_and_a_dead_one_does_not_block(tmp_path):
         raise ZeroDivisionError  # an error lets go of it too
     with owned(folder):
         pass
+    with owned(tmp_path / "tried"):
+        pass
+    assert not (tmp_path / "tried").exists()  # nothing came of it
 
 
 def random_policy(activation, output):
