@@ -10,6 +10,7 @@ mkdir -p "$out"
 figure() { "${PYTHON:-python}" -m experiments.cli figure "$@"; }
 
 figure $results/driving_methods.csv --out $out/driving_methods.png
+figure $results/driving_confirmation.csv --out $out/driving_confirmation.png
 figure $results/lift_ppl.csv --out $out/lift_ppl.png
 figure $results/driving_horizon.csv --steps 5000 10000 15000 --out $out/driving_horizon.png
 figure $results/table_wiping_horizon.csv --steps 2000 4000 6000 --out $out/wiping_horizon.png
