@@ -121,15 +121,34 @@ class Recorder:
         columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         _write(self.folder / f"{events:010d}.npz", columns | {"next_episode": self.episode})
 
-    def rewind(self, events: int) -> None:
-        """Drop the pieces beyond line `events` of the log: those steps are repeated."""
+    def rewind(self, events: int) -> tuple[int, PredictedPath | None]:
+        """Drop the pieces beyond line `events` of the log: those steps are repeated.
+
+        Returns:
+            The number of steps in the episode under way, and the path that was shown last in it.
+        """
         self.rows, self.episode = [], 0
         for path in _pieces(self.folder):
             if int(path.stem) > events:
                 path.unlink()
-        for path in _pieces(self.folder)[-1:]:
+        pieces = _pieces(self.folder)
+        if not pieces:
+            return 0, None
+        with np.load(pieces[-1], allow_pickle=False) as piece:
+            self.episode = int(piece["next_episode"])
+        if restarts := events - int(pieces[-1].stem):  # lines of the log that are no steps
+            self.episode += restarts
+            return 0, None
+        steps, shown = 0, None
+        for path in reversed(pieces):
             with np.load(path, allow_pickle=False) as piece:
-                self.episode = int(piece["next_episode"])
+                mine = int(np.sum(piece[EPISODE] == self.episode))
+                if mine and shown is None and AHEAD in piece:
+                    shown = PredictedPath(piece[AHEAD][-1], bool(piece[FAILS][-1]))
+                steps += mine
+                if mine < len(piece[EPISODE]):
+                    break
+        return (steps, shown) if shown is not None else (0, None)
 
 
 def _pieces(folder: Path) -> list[Path]:

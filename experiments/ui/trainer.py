@@ -130,7 +130,7 @@ class InteractiveTrainer:
         done, self.learner = restore_learner(self.folder, self.learner, repeats=True)
         self.events = self._saved = done
         self.steps = int(self.learner.counters.steps)
-        self.recorder.rewind(done)
+        self._since, self.ahead = self.recorder.rewind(done)
         if len(lines) > done:
             report(f"repeating {len(lines) - done} steps")
         for line in lines[done:]:

@@ -213,13 +213,14 @@ def drive(made, steps, first=0):
         made.learn()
 
 
-def test_a_killed_session_goes_on_as_if_it_had_never_stopped(tmp_path):
+@pytest.mark.parametrize("saved", [48, 97])  # within a prediction; right before a restart
+def test_a_killed_session_goes_on_as_if_it_had_never_stopped(saved, tmp_path):
     whole = trainer(tmp_path / "whole")
     drive(whole, 120)
     broken = trainer(tmp_path / "broken")
-    drive(broken, 50)
+    drive(broken, saved)
     broken.save(wait=True)
-    drive(broken, 55, 50)
+    drive(broken, 105 - saved, saved)
     broken._file.close()
     # killed: what is in memory is gone, the line being written is cut short
     with open(tmp_path / "broken" / LOG, "a") as file:
@@ -643,3 +644,19 @@ def test_a_missing_package_is_one_line_with_the_command(monkeypatch):
     with pytest.raises(UserError) as refusal:
         views.display_of("table_wiping")
     assert str(refusal.value) == ("showing table_wiping needs PIL: pip install 'ppl-jax[ui]'")
+
+
+def test_a_session_left_right_after_a_restart_counts_its_episodes_on(tmp_path):
+    whole, left = trainer(tmp_path / "whole"), trainer(tmp_path / "left")
+    for made in (whole, left):
+        drive(made, 30)
+        made.save(wait=True)
+        made.restart()
+    left.close()
+    again = trainer(tmp_path / "left", resume=True)
+    for made in (whole, again):
+        drive(made, 5, 40)
+        made.close()
+    one, other = (recording.load(tmp_path / name)[0] for name in ("whole", "left"))
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
