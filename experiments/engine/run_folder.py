@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from pathlib import Path
 from typing import Any
 
+from experiments.engine.csv_file import Table, numbers, read_table
 from experiments.engine.files import as_json, make_out_folder, unusable, write_text_atomic
 from experiments.engine.runtime import UserError
 
@@ -77,20 +79,33 @@ class RunFolder:
     def append_evaluation(self, rows: list[dict[str, Any]]) -> None:
         """Append rows to evaluation.csv (with a header when new)."""
         path = self.path / EVALUATION
-        new = not path.exists()
+        held = self._evaluated()
+        columns = held.columns if held is not None else list(rows[0])
         with open(path, "a", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            if new:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            if held is None:
                 writer.writeheader()
             writer.writerows(rows)
 
     def has_gone_on(self) -> bool:
         """Whether a second evaluation was logged: a checkpoint was written after the first."""
-        evaluation = self.path / EVALUATION
-        if not evaluation.is_file():
-            return False
-        with open(evaluation, newline="") as file:
-            return len({row["step"] for row in csv.DictReader(file)}) > 1
+        held = self._evaluated()
+        return held is not None and len(set(held.column("step"))) > 1
+
+    def _evaluated(self) -> Table | None:
+        """The whole lines of evaluation.csv; None where there is not even a header.
+
+        Raises:
+            UserError: If it is no such file.
+        """
+        path = self.path / EVALUATION
+        if not path.is_file() or b"\n" not in path.read_bytes():
+            path.unlink(missing_ok=True)  # killed within its first line
+            return None
+        table = read_table(path, cut=True)
+        if "step" not in table.columns:
+            raise UserError(f"{str(path)!r} has no column 'step'")
+        return table
 
     def rewind(self, done: int, step: int) -> None:
         """Drop what was logged later: a resumed run writes it again.
@@ -98,26 +113,34 @@ class RunFolder:
         Args:
             done: Steps and offline updates done: metrics up to there stay.
             step: Environment step of the last evaluation that stays.
+
+        Raises:
+            UserError: If a file holds something else; both stay as they are.
         """
-        metrics = self.path / METRICS
-        if metrics.exists():
-            kept = []
-            for line in metrics.read_text().splitlines():
-                try:
-                    row = json.loads(line)
-                except ValueError:  # the line that was being written when the run was killed
-                    continue
-                if row["done"] <= done:
+        metrics, kept = self.path / METRICS, []
+        for number, line in whole_lines(metrics):
+            try:
+                if json.loads(line)["done"] <= done:
                     kept.append(line + "\n")
+            except (ValueError, TypeError, KeyError) as error:
+                raise UserError(f"{str(metrics)!r}, line {number} is no line of a run") from error
+        table, text = self._evaluated(), io.StringIO()
+        if table is not None:
+            path = self.path / EVALUATION
+            steps = numbers(table.column("step"), table.lines, "step", path, low=0, whole=True)
+            rows = [row for row, at in zip(table.rows, steps, strict=True) if at <= step]
+            csv.writer(text, lineterminator="\n").writerows([table.columns, *rows])
+            write_text_atomic(path, text.getvalue())
+        if metrics.exists():
             write_text_atomic(metrics, "".join(kept))
-        evaluation = self.path / EVALUATION
-        if evaluation.exists():
-            lines = evaluation.read_text().splitlines(keepends=True)
-            header = lines[:1]
-            columns = header[0].strip().split(",") if header else []
-            kept = header
-            for line in lines[1:]:
-                cells = line.strip().split(",")
-                if len(cells) == len(columns) and int(cells[columns.index("step")]) <= step:
-                    kept.append(line)
-            write_text_atomic(evaluation, "".join(kept))
+
+
+def whole_lines(path: Path) -> list[tuple[int, str]]:
+    """The lines of a log with their numbers, from 1; none where it is not there.
+
+    A last line without its end was being written when the process was killed: it is left out.
+    """
+    if not path.exists():
+        return []
+    *whole, _ = path.read_text(encoding="utf-8-sig", errors="replace").split("\n")
+    return [(number, line) for number, line in enumerate(whole, 1) if line.strip()]

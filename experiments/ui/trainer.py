@@ -28,7 +28,8 @@ from experiments.engine.files import as_json
 from experiments.engine.policy_file import save_policy
 from experiments.engine.recording import PredictedPath, Recorder
 from experiments.engine.run import algorithm_factory, restore_learner, saved_policy
-from experiments.engine.run_folder import EVALUATION, POLICY, SUMMARY, RunFolder
+from experiments.engine.run_folder import EVALUATION, POLICY, SUMMARY, RunFolder, whole_lines
+from experiments.engine.runtime import UserError
 from experiments.engine.settings import RunSettings
 from ppl_jax import checkpoint
 from ppl_jax.interaction import Learner, summarise
@@ -126,7 +127,7 @@ class InteractiveTrainer:
 
     def _resume(self, report: Report) -> None:
         """Restore the last checkpoint and repeat the steps since."""
-        lines = _whole_lines(self.folder.path / LOG)
+        lines = _session_lines(self.folder.path / LOG)
         done, self.learner = restore_learner(self.folder, self.learner, repeats=True)
         self.events = self._saved = done
         self.steps = int(self.learner.counters.steps)
@@ -354,21 +355,25 @@ def _copy(leaf: jax.Array) -> jax.Array:
     return jnp.copy(leaf)
 
 
-def _whole_lines(path: Path) -> list[dict[str, Any]]:
-    """The log's lines; an incomplete last one is removed from the file."""
-    if not path.exists():
-        return []
-    content, lines, kept = path.read_bytes(), [], 0
-    for line in content.splitlines(keepends=True):
+def _session_lines(path: Path) -> list[dict[str, Any]]:
+    """The log's lines; an incomplete last one is removed from the file.
+
+    Raises:
+        UserError: If another one is no line of a session: nothing is removed.
+    """
+    lines = []
+    for number, line in whole_lines(path):
         try:
-            lines.append(json.loads(line))
-        except ValueError:
-            break
-        if not line.endswith(b"\n"):
-            lines.pop()
-            break
-        kept += len(line)
-    if kept < len(content):
-        with open(path, "rb+") as file:
-            file.truncate(kept)
+            row = json.loads(line)
+            if row["do"] != "restart" and not {"takeover", "action"} <= row.keys():
+                raise KeyError("action")
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise UserError(f"{str(path)!r}, line {number} is no line of a session") from error
+        lines.append(row)
+    if path.exists():
+        content = path.read_bytes()
+        kept = content.rfind(b"\n") + 1
+        if kept < len(content):
+            with open(path, "rb+") as file:
+                file.truncate(kept)
     return lines

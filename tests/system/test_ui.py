@@ -237,6 +237,19 @@ def test_a_killed_session_goes_on_as_if_it_had_never_stopped(saved, tmp_path):
     assert one["episode"].max() >= 2
 
 
+def test_a_log_with_a_line_that_is_none_is_left_as_it_is(tmp_path):
+    made = trainer(tmp_path / "run")
+    drive(made, 10)
+    made._file.close()
+    path = tmp_path / "run" / LOG
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*lines[:4], "[]\n", *lines[4:]]))
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="line 5 is no line of a session"):
+        trainer(tmp_path / "run", resume=True)
+    assert path.read_bytes() == before
+
+
 def test_a_session_whose_first_checkpoint_never_came_goes_on(tmp_path):
     broken = trainer(tmp_path / "run")
     drive(broken, 40)

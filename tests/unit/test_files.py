@@ -135,3 +135,63 @@ def test_other_kinds_of_policy_files_are_refused(name, tmp_path):
     with pytest.raises(UserError, match=r"out must end in \.npz or \.onnx, got "):
         export(tmp_path / "p.npz", tmp_path / name)
     assert not (tmp_path / name).exists()
+
+
+def logged(tmp_path):
+    tmp_path.mkdir()
+    folder = RunFolder(tmp_path)
+    for step in (10, 20, 30):
+        folder.append_metrics({"step": step, "done": step})
+        folder.append_evaluation([{"step": step, "scenario": n, "success": 1} for n in (0, 1)])
+    return folder
+
+
+def texts(folder):
+    return [(folder.path / name).read_text() for name in FILES]
+
+
+FILES = ("metrics.jsonl", "evaluation.csv")
+
+
+def test_rewinding_drops_what_is_later_and_what_was_cut_off(tmp_path):
+    folder = logged(tmp_path / "a")
+    before = texts(folder)
+    for name, text, cut in zip(FILES, before, ('{"step": 40, "do', "40,0"), strict=True):
+        (tmp_path / "a" / name).write_text(text + cut)
+    folder.rewind(30, 30)
+    assert texts(folder) == before
+    folder.rewind(20, 20)
+    assert [text.count("\n") for text in texts(folder)] == [2, 1 + 4]
+    folder.append_metrics({"step": 30, "done": 30})
+    folder.append_evaluation([{"step": 30, "scenario": n, "success": 1} for n in (0, 1)])
+    assert texts(folder) == before
+
+
+def test_rewinding_takes_what_another_program_wrote(tmp_path):
+    folder = logged(tmp_path / "a")
+    path = tmp_path / "a" / "evaluation.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    lines = [";".join([row[2], row[0] + (".0" if i else ""), row[1]]) for i, row in enumerate(rows)]
+    path.write_bytes("\r\n".join(["\ufeff" + lines[0], *lines[1:], ""]).encode())
+    folder.rewind(20, 20)
+    folder.append_evaluation([{"step": 30, "scenario": 0, "success": 0}])
+    text = path.read_text()
+    assert text == "success,step,scenario\n1,10.0,0\n1,10.0,1\n1,20.0,0\n1,20.0,1\n0,30,0\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("metrics.jsonl", "{}\n", "line 1 is no line of a run"),
+        ("metrics.jsonl", '{"done": 10}\n[1]\n{"done": 30}\n', "line 2 is no line of a run"),
+        ("evaluation.csv", "a,b\n1,2\n", "has no column 'step'"),
+        ("evaluation.csv", "step,success\nx,1\n", "row 2: step must be a whole number"),
+    ],
+)
+def test_rewinding_loses_nothing_of_what_it_does_not_know(name, content, said, tmp_path):
+    folder = logged(tmp_path / "a")
+    (tmp_path / "a" / name).write_text(content)
+    before = texts(folder)
+    with pytest.raises(UserError, match=said):
+        folder.rewind(10, 10)
+    assert texts(folder) == before
