@@ -250,10 +250,10 @@ def _check_range(name: str, value: Any, field: About) -> None:
         return
     if field.low is None:
         return
-    check_number(name, value)
     high = math.inf if field.high is None else field.high
-    if not field.low <= value <= high:
+    if not math.isfinite(value) or not field.low <= value <= high:
         raise ValueError(f"{name} must {allowed(field, isinstance(value, int))}, got {value}")
+    check_number(name, value)
 
 
 def catalogue(config: PPOConfig, hparams: PPOHParams) -> dict[str, Setting]:
