@@ -150,7 +150,9 @@ def test_committed_results_are_listed_and_there():
     text = (folder / "README.md").read_text()
     named = re.findall(r"^\| ((?:`[^`]+`(?:, )?)+) \|", text, re.M)
     files = {name for cell in named for name in re.findall(r"`([^`]+)`", cell)}
-    assert files == {path.name for path in folder.iterdir() if path.suffix in (".csv", ".json")}
+    assert files == {
+        path.name for path in folder.iterdir() if path.suffix in (".csv", ".gz", ".json")
+    }
 
 
 def test_python_shown_is_python():
