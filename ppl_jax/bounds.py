@@ -33,7 +33,8 @@ import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
+
+from ppl_jax.checks import check_limit
 
 
 @flax.struct.dataclass
@@ -149,11 +150,7 @@ def preference_pairs(
         ValueError: If L, where it is not traced, exceeds `max_horizon`.
     """
     _check(mdp, expert, novice)
-    if not isinstance(preference_horizon, Tracer) and preference_horizon > max_horizon:
-        raise ValueError(
-            f"preference_horizon must not exceed max_horizon ({max_horizon}), got "
-            f"{preference_horizon}"
-        )
+    check_limit("preference_horizon", preference_horizon, "max_horizon", max_horizon)
     chex.assert_equal_shape([taken_over, mdp.start], custom_message="taken_over and start")
     begun = jnp.einsum("s,sp,sn->nps", taken_over, expert, novice)  # [A-, A+, S]
     held = jnp.moveaxis(mdp.transition, 1, 0)  # [A-, S, S]

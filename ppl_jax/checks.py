@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from jax.core import Tracer
 
 LARGEST = 1e19  # its square is still a float32: losses and Adam square what they get
 LARGEST_WHOLE = 2**31 - 1  # an int32
@@ -51,7 +52,24 @@ def check_number(argument: str, value: Any) -> None:
     shown = numbers.tolist() if numbers.ndim else value
     if not np.isfinite(numbers).all():
         raise ValueError(f"{argument} must be a finite number, got {shown}")
-    largest = LARGEST if np.issubdtype(numbers.dtype, np.floating) else LARGEST_WHOLE
+    real = np.issubdtype(numbers.dtype, np.floating)
+    largest, said = (LARGEST, f"{LARGEST:g}") if real else (LARGEST_WHOLE, str(LARGEST_WHOLE))
     if (np.abs(numbers.astype(np.float64)) > largest).any():
-        shape = f"{largest:g}" if largest == LARGEST else str(largest)
-        raise ValueError(f"{argument} must be at most {shape} in size, got {shown}")
+        raise ValueError(f"{argument} must be at most {said} in size, got {shown}")
+
+
+def check_limit(argument: str, value: Any, limit: str, most: int) -> None:
+    """Check that numbers do not exceed a limit; traced ones have no value to check.
+
+    Args:
+        argument: Name in the message.
+        value: A number, or an array of them.
+        limit: What the limit is, in the message.
+        most: The limit.
+
+    Raises:
+        ValueError: One line naming the argument, its value and the limit.
+    """
+    if not isinstance(value, Tracer) and (np.asarray(value) > most).any():
+        shown = np.asarray(value).tolist()
+        raise ValueError(f"{argument} must not exceed {limit} ({most}), got {shown}")

@@ -13,9 +13,8 @@ from __future__ import annotations
 import chex
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 
-from ppl_jax.checks import check_name
+from ppl_jax.checks import check_limit, check_name
 from ppl_jax.types import Interaction, PreferenceBatch
 
 PAIR_STATES = ("predicted", "future", "shifted")
@@ -47,11 +46,7 @@ def preference_pairs(
     chex.assert_equal_shape(
         [step.expert_action, step.novice_action], custom_message="expert_action and novice_action"
     )
-    if not isinstance(preference_horizon, Tracer) and preference_horizon > count:
-        raise ValueError(
-            f"preference_horizon must not exceed the predicted states ({count}), got "
-            f"{preference_horizon}"
-        )
+    check_limit("preference_horizon", preference_horizon, "the predicted states", count)
     first = jnp.arange(count, dtype=jnp.float32) < preference_horizon
     mask = step.takeover & predicted.valid & first
     observation, rejected = predicted.observation, None

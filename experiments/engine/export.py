@@ -9,23 +9,13 @@ from typing import Any
 import numpy as np
 
 from experiments.engine.evaluate import policy_path, read_policy, run_spec
-from experiments.engine.files import write_atomic
+from experiments.engine.files import check_ending, write_atomic
 from experiments.engine.policy_file import load_meta
-from experiments.engine.runtime import UserError, need
+from experiments.engine.runtime import need
 from ppl_jax.experts import SavedPolicy
 
 ENDINGS = (".npz", ".onnx")
 _OPSET, _IR = 17, 8  # of 2022: runtimes since then read the file
-
-
-def check_ending(out: Path) -> None:
-    """Refuse a file of a kind that is not written.
-
-    Raises:
-        UserError: One line.
-    """
-    if out.suffix not in ENDINGS:
-        raise UserError(f"out must end in {' or '.join(ENDINGS)}, got {str(out)!r}")
 
 
 def export(run: Path, out: Path) -> None:
@@ -39,7 +29,7 @@ def export(run: Path, out: Path) -> None:
     Raises:
         UserError: If there is no policy, or the ending is another.
     """
-    check_ending(out)
+    check_ending(out, ENDINGS)
     source = policy_path(run)
     policy = read_policy(source, run_spec(run))
     if out.suffix == ".onnx":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -91,6 +91,17 @@ def check_out_file(path: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise unusable(path, error) from error
+
+
+def check_ending(out: Path, endings: Sequence[str]) -> None:
+    """Refuse a file of a kind that is not written.
+
+    Raises:
+        UserError: One line.
+    """
+    if out.suffix not in endings:
+        listed = (" or " if len(endings) == 2 else ", ").join(endings)
+        raise UserError(f"out must end in {listed}, got {str(out)!r}")
 
 
 def unusable(path: Path, error: OSError) -> UserError:

@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO
 
 from experiments.engine.files import make_out_folder, unusable
 from experiments.engine.runtime import UserError
@@ -38,7 +38,7 @@ def owned(folder: Path) -> Iterator[None]:
     make_out_folder(folder)
     path = folder / LOCK
     try:
-        file = open(path, "a+")  # noqa: SIM115 - held until the work is done
+        file = open(path, "ab+", buffering=0)  # noqa: SIM115 - held until the work is done
     except OSError as error:
         raise unusable(folder, error) from error
     with file:
@@ -46,7 +46,7 @@ def owned(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            who = file.read().strip() or "another process"
+            who = file.read().decode().strip() or "another process"
             raise UserError(
                 f"out {str(folder)!r} is being written by {who}: wait until it is done, stop it, "
                 "or give another --out"
@@ -61,6 +61,9 @@ def owned(folder: Path) -> Iterator[None]:
             )
         try:
             _say(file, f"process {os.getpid()} on {platform.node()} since {_now()} ({_program()})")
+        except OSError as error:
+            raise unusable(folder, error) from error
+        try:
             yield
         finally:
             with contextlib.suppress(OSError):
@@ -70,10 +73,9 @@ def owned(folder: Path) -> Iterator[None]:
                     folder.rmdir()
 
 
-def _say(file: TextIO, line: str) -> None:
+def _say(file: BinaryIO, line: str) -> None:
     file.truncate(0)
-    file.write(line)
-    file.flush()
+    file.write(line.encode())
 
 
 def _now() -> str:

@@ -43,7 +43,7 @@ from experiments.engine.columns import (
     joined,
 )
 from experiments.engine.config_file import checked_content, read_config
-from experiments.engine.files import write_atomic
+from experiments.engine.files import check_ending, write_atomic
 from experiments.engine.runtime import UserError, need
 from ppl_jax.interaction import no_prediction
 from ppl_jax.npz import read_npz
@@ -142,12 +142,12 @@ class Recorder:
         steps, shown = 0, None
         for path in reversed(pieces):
             with np.load(path, allow_pickle=False) as piece:
-                mine = int(np.sum(piece[EPISODE] == self.episode))
-                if mine and shown is None and AHEAD in piece:
+                mine = piece[EPISODE] == self.episode
+                if mine.any() and shown is None and AHEAD in piece:
                     shown = PredictedPath(piece[AHEAD][-1], bool(piece[FAILS][-1]))
-                steps += mine
-                if mine < len(piece[EPISODE]):
-                    break
+            steps += int(mine.sum())
+            if not mine.all():
+                break
         return (steps, shown) if shown is not None else (0, None)
 
 
@@ -203,8 +203,7 @@ def export(run: Path, out: Path) -> int:
     Raises:
         UserError: If there is nothing to export, or `out` is no .npz.
     """
-    if out.suffix != ".npz":
-        raise UserError(f"out must end in .npz, got {str(out)!r}")
+    check_ending(out, (".npz",))
     columns, config = load(run)
     _write(out, columns | {META: np.str_(json.dumps(config))})
     return len(columns[EPISODE])

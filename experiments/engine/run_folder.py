@@ -67,10 +67,6 @@ class RunFolder:
         """Replace a JSON file in one step."""
         write_text_atomic(self.path / name, as_json(content, indent=2) + "\n")
 
-    def read_json(self, name: str) -> Any:
-        """Read a JSON file of the folder."""
-        return json.loads((self.path / name).read_text())
-
     def append_metrics(self, row: dict[str, Any]) -> None:
         """Append one line to metrics.jsonl."""
         with open(self.path / METRICS, "a", newline="") as file:
@@ -78,12 +74,13 @@ class RunFolder:
 
     def append_evaluation(self, rows: list[dict[str, Any]]) -> None:
         """Append rows to evaluation.csv (with a header when new)."""
-        path = self.path / EVALUATION
-        held = self._evaluated()
-        columns = held.columns if held is not None else list(rows[0])
+        path, columns = self.path / EVALUATION, list(rows[0])
+        if there := path.exists():
+            with open(path, newline="") as file:
+                columns = next(csv.reader(file))  # another program may have changed their order
         with open(path, "a", newline="") as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n")
-            if held is None:
+            if not there:
                 writer.writeheader()
             writer.writerows(rows)
 
@@ -99,8 +96,7 @@ class RunFolder:
             UserError: If it is no such file.
         """
         path = self.path / EVALUATION
-        if not path.is_file() or b"\n" not in path.read_bytes():
-            path.unlink(missing_ok=True)  # killed within its first line
+        if not path.is_file() or b"\n" not in path.read_bytes():  # killed within its first line
             return None
         table = read_table(path, cut=True)
         if "step" not in table.columns:
@@ -124,9 +120,10 @@ class RunFolder:
                     kept.append(line + "\n")
             except (ValueError, TypeError, KeyError) as error:
                 raise UserError(f"{str(metrics)!r}, line {number} is no line of a run") from error
-        table, text = self._evaluated(), io.StringIO()
-        if table is not None:
-            path = self.path / EVALUATION
+        path, table, text = self.path / EVALUATION, self._evaluated(), io.StringIO()
+        if table is None:
+            path.unlink(missing_ok=True)
+        else:
             steps = numbers(table.column("step"), table.lines, "step", path, low=0, whole=True)
             rows = [row for row, at in zip(table.rows, steps, strict=True) if at <= step]
             csv.writer(text, lineterminator="\n").writerows([table.columns, *rows])

@@ -47,7 +47,8 @@ def local(jobs: Sequence[Job], processes: int, log: Path) -> Iterator[tuple[int,
     for number in range(len(jobs)):
         waiting.put(number)
     done: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
-    workers = [_Process(core, log, preparation()) for core in cores(processes)[: len(jobs)]]
+    known = preparation()
+    workers = [_Process(core, log, known) for core in cores(processes)[: len(jobs)]]
 
     def work(worker: _Process) -> None:
         while True:

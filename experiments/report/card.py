@@ -22,7 +22,7 @@ from experiments.engine.evaluate import (
 from experiments.engine.expert_settings import read_settings
 from experiments.engine.fields import read_fields, read_json
 from experiments.engine.files import as_json, write_text_atomic
-from experiments.engine.run_folder import EVALUATION, METRICS, SUMMARY, RunFolder
+from experiments.engine.run_folder import EVALUATION, METRICS, SUMMARY, RunFolder, whole_lines
 from experiments.engine.runtime import UserError
 from experiments.options.expert import command_of
 from experiments.report.tables import write_rows
@@ -115,16 +115,15 @@ def _logged(path: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: One line naming the line that is none.
     """
+    kinds = {"step": int} | {f"train/{name}": float | None for name in TRAINING}
     found = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+    for number, line in whole_lines(path):
         where = f"{str(path)!r}, line {number}"
         try:
-            content = json.loads(line) if line.strip() else None
+            content = json.loads(line)
         except ValueError as error:
             raise UserError(f"{where} is no JSON ({error})") from error
-        if content is not None:
-            kinds = {"step": int} | {f"train/{name}": float | None for name in TRAINING}
-            found.append(read_fields(content, kinds, where, needed=("step",)))
+        found.append(read_fields(content, kinds, where, needed=("step",)))
     return found
 
 

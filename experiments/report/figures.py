@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments.engine.fields import read_fields, read_json
+from experiments.engine.files import check_ending
 from experiments.engine.runtime import UserError, need
 from experiments.report.points import (
     NOTHING,
@@ -89,7 +90,10 @@ def figure(
     if kind is not None:
         known("kind", kind, KINDS)
     need("matplotlib", "plot", "ppl figure")
-    _check_ending(out)
+    from matplotlib.figure import Figure
+
+    kinds = Figure().canvas.get_supported_filetypes()
+    check_ending(out.with_suffix(out.suffix.lower()), [f".{kind}" for kind in sorted(kinds)])
     if kind == "steering":
         from experiments.report.steering import steering
 
@@ -119,16 +123,6 @@ def figure(
         over_axis(points, several[0], out, column, steps=steps)
     else:
         heatmap(points, several, out, column)
-
-
-def _check_ending(out: Path) -> None:
-    """Refuse a kind of picture that matplotlib does not write."""
-    from matplotlib.figure import Figure
-
-    kinds = Figure().canvas.get_supported_filetypes()
-    if out.suffix[1:].lower() not in kinds:
-        endings = ", ".join(f".{kind}" for kind in sorted(kinds))
-        raise UserError(f"out must end in {endings}, got {str(out)!r}")
 
 
 def _cards(folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ import numpy as np
 from envs.driving.rendering import Paths, Scene, draw, save_frames
 from envs.driving.scenario import tree_index
 from experiments.engine.evaluate import make_env, named_expert, run_hparams, run_options
+from experiments.engine.files import check_ending
 from experiments.engine.runtime import UserError, need
 from ppl_jax import algorithms
 from ppl_jax.config import HParams, as_arrays, env_params
@@ -49,8 +50,7 @@ def render(
     Raises:
         UserError: If one of them cannot be used.
     """
-    if out.suffix not in SUFFIXES:
-        raise UserError(f"out must end in {', '.join(SUFFIXES)}, got {str(out)!r}")
+    check_ending(out, SUFFIXES)
     if steps < 1:
         raise UserError(f"steps must be at least 1, got {steps}")
     need("PIL", "render", "ppl render")

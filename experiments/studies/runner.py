@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from envs.registry import known, unknown
 from experiments.engine import compile_log
 from experiments.engine import schedulers as engines
+from experiments.engine.fields import read_fields, read_json
 from experiments.engine.files import as_json, unusable, write_text_atomic
 from experiments.engine.ownership import LOCK, owned
 from experiments.engine.preparation import stop_if_preparing
@@ -320,15 +321,9 @@ def _read_settings(path: Path) -> dict[str, Any]:
     Raises:
         UserError: If it holds none.
     """
-    try:
-        runs = json.loads(path.read_text())["runs"]
-        if not all(isinstance(held, dict) for held in runs.values()):
-            raise TypeError("runs must hold objects")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{str(path)!r} cannot be read ({type(error).__name__}: {error}): give another --out"
-        ) from error
-    return runs
+    where = repr(str(path))
+    runs = read_fields(read_json(path), {"runs": dict}, where, needed=("runs",))["runs"]
+    return read_fields(runs, dict.fromkeys(runs, dict), f"{where}, runs")
 
 
 _MAY_DIFFER = ("schema", "max_preference_horizon")  # the second only bounds L

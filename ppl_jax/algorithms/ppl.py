@@ -15,6 +15,7 @@ import numpy as np
 from ppl_jax import buffers, horizon
 from ppl_jax.algorithms.base import Algorithm
 from ppl_jax.buffers import RingBuffer
+from ppl_jax.checks import check_limit
 from ppl_jax.config import HParams, TrainConfig
 from ppl_jax.fields import setting
 from ppl_jax.learned import Learned, adam_step, init_learned
@@ -74,14 +75,11 @@ class PPLConfig(ClonerConfig):
         Raises:
             ValueError: One line naming field, value and what is allowed.
         """
-        horizon = np.asarray(hparams.method.preference_horizon)
-        shown = horizon.tolist()
-        for name, most in (
+        for limit, most in (
             ("prediction_horizon", config.prediction_horizon),
             ("max_preference_horizon", self.max_preference_horizon),
         ):
-            if (horizon > most).any():
-                raise ValueError(f"preference_horizon must not exceed {name} ({most}), got {shown}")
+            check_limit("preference_horizon", hparams.method.preference_horizon, limit, most)
         if self.objective in NEEDS_REFERENCE and self.policy != "deterministic":
             raise ValueError(
                 f"policy must be deterministic with objective {self.objective}, whose reference "

@@ -1,5 +1,6 @@
 """Files that are written whole, folders that have one owner, policies for other programs."""
 
+import contextlib
 import json
 import os
 import signal
@@ -99,6 +100,29 @@ def test_a_folder_has_one_owner_and_a_dead_one_does_not_block(tmp_path):
     with owned(tmp_path / "tried"):
         pass
     assert not (tmp_path / "tried").exists()  # nothing came of it
+
+
+def test_a_folder_without_room_is_refused_in_a_line(tmp_path):
+    small = tmp_path / "small"
+    small.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(small)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("a small disk cannot be mounted here (needs root)")
+    try:
+        (small / "run").mkdir()
+        with contextlib.suppress(OSError), open(small / "filler", "wb", buffering=0) as filler:
+            while True:
+                filler.write(bytes(4096))
+        with (
+            pytest.raises(UserError, match="cannot be written: No space left"),
+            owned(small / "run"),
+        ):
+            pytest.fail("owned without room")
+        (small / "filler").unlink()
+        with owned(small / "run"):
+            pass
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
 
 
 def random_policy(activation, output):
